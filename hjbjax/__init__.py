@@ -12,25 +12,25 @@ if TYPE_CHECKING:
     from hjbjax._names import *  # noqa: F403
     from hjbjax._names import __all__ as __all__
 
-LATER = ("filtering", "plotting", "zoo")  # imported on first use: a third of the seconds that the package takes
+LATER = ("filtering", "plotting", "zoo")  # imported on first use: a third of the import time of the package
 
 
 def __getattr__(name: str) -> "Any":
     """A public name, imported on first use.
 
-    Importing JAX and the package takes more than a second. The command parses its words, prints its help and handles
-    Ctrl-C before that, and ``hjbjax doctor`` reports a broken installation of JAX instead of ending with a traceback.
+    Importing JAX and the package takes more than a second. The command line parses its arguments, prints its help and
+    handles Ctrl-C before that, and ``hjbjax doctor`` can report a broken JAX installation without a traceback.
     """
     import importlib
 
     if name in LATER:
         return importlib.import_module(f"hjbjax.{name}")
-    if name == "__all__" or not name.startswith("__"):  # inspect and doctest look for special names that no module has
+    if name == "__all__" or not name.startswith("__"):  # inspect and doctest ask for special names that do not exist
         public = importlib.import_module("hjbjax._names")
         if name == "__all__" or name in public.__all__:
             globals()[name] = found = getattr(public, name)
             return found
-        if name in globals():  # a folder of the package, by now imported
+        if name in globals():  # a subpackage that has been imported meanwhile
             return globals()[name]
     # with the name, from which Python derives its suggestion
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])

@@ -1,7 +1,7 @@
 """Feedback in use: closed loops, their paths, safety filters and the energies along paths.
 
-Read ``simulation`` for ``simulate``, ``feedback`` for the control between the nodes, ``closed_loop`` for what is
-integrated, ``loop`` for it at one state and for noise at a target, ``path`` for what comes back; ``safety_filter``
-filters a control and ``dissipation`` counts energies. Where the state is not measured, ``output_feedback`` closes the
-loop through an observer.
+- ``simulation``: ``simulate``; ``closed_loop`` integrates the loop, ``loop`` evaluates it at one state.
+- ``feedback``: the control between the nodes; ``path``: the result; ``payments``: its cost compared with V.
+- ``safety_filter``: a control that keeps the state in a tube; ``dissipation``: energies along paths.
+- ``output_feedback``: the loop through an observer, if the state is not measured.
 """

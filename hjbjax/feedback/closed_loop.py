@@ -1,24 +1,24 @@
-"""Closed loops and their integration: what a feedback does to the system, and what that costs.
+"""Closed loops and their integration: the path of the system under a feedback, and its cost.
 
     dx = f(x, u, d) dt + σ(x, u, d) dw,  u = control(x),  d = opponent(x)
-    cost = ∫ e^{−βt} L(x, u, d) dt + what is due at the end; of a tube an extreme along the path: see ``payments``
+    cost = ∫ e^{−βt} L(x, u, d) dt + payment at the end; for a tube an extreme along the path, see ``payments``
 
 The running cost is one more state of the integrator, so it has the accuracy of the path.
 
-Without noise: Tsit5 with adaptive steps, no longer than the distance of two output times. A feedback that jumps
-(bang-bang) makes any adaptive stepper crawl along its switching curve, so no step is shorter than
-2·duration/max_steps: there the path chatters within f·(that step) of the curve, as a fast sampler would. For such
-a feedback a zero-order hold is faster, and is what hardware does.
-With noise: fixed steps in Itô's sense on a virtual Brownian tree. Noise that is a number or a matrix: SRA1 (strong
-order 1.5 in a smooth closed loop); noise that is a function: Euler–Maruyama (strong order ½, weak order 1).
-Rejecting steps would bias the law of the path, so ``rtol`` and ``atol`` have no say here.
+Without noise: Tsit5 with adaptive steps, at most one output interval long. A feedback that jumps (bang-bang) makes any
+adaptive stepper crawl along its switching curve, so no step is shorter than 2·duration/max_steps. The path then
+chatters within f·(that step) of the curve, like a fast sampler. A zero-order hold, as in hardware, is faster there.
+With noise: fixed steps in the Itô sense on a virtual Brownian tree. Noise that is a number or a matrix uses SRA1
+(strong order 1.5 in a smooth closed loop); noise that is a function uses Euler–Maruyama (strong order ½, weak order 1).
+Rejecting steps would bias the law of the path, so ``rtol`` and ``atol`` are ignored.
 
-The target, the edge of the box and the end of what the players know are looked for at the end of every internal
-step, and located by bisection of that step's interpolant; the path ends on their far side, by rounding. Inside the
-target a Solution has no control, and a step that ends there still wants one at its stages: it is that of the last
-place on the straight way there where the players had an answer.
-With noise a target is also met between the ends of a step, by a draw of its own: see ``loop``. A mean time
-to a target then has the order 1 in the step. The edge of the box is looked at at the ends of steps alone.
+After every internal step the path is tested for the target, the boundary of the box and the end of the region in which
+the players are defined. Bisection of the interpolant locates the crossing, and the path ends just beyond it. A Solution
+has no control inside the target, but the stages of the last step need one: they use the control at the last point of
+the straight line there at which the players are defined.
+
+With noise a target can also be met between the ends of a step, see ``loop``. The mean time to a target then has order 1
+in the step. The boundary of the box is only tested at the ends of steps.
 """
 
 import functools
@@ -39,19 +39,19 @@ from hjbjax.problem.types import Array, Control, Key, Number, State
 if TYPE_CHECKING:
     import diffrax
 
-# Before an interval: the time, the state with the running cost (n+1), the PathStatus, the steps so far, and of a tube
+# Before an interval: the time, the state with the running cost (n+1), the PathStatus, the steps so far, and for a tube
 # the least cost of stopping so far and the largest running maximum, (2,).
 Progress: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
-Beginning: TypeAlias = tuple[Control, Number, State]  # of an interval: the control held through it, when and where
-# Of each interval: time and state at its end, both actions at its start, and True where the path runs through it.
+Beginning: TypeAlias = tuple[Control, Number, State]  # of an interval: the held control, the time and the state
+# For each interval: time and state at its end, both actions at its start, and True if the path runs through it.
 Rows: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None, jax.Array]
 
-LOOKS = 16  # in an output interval at the functions of a tube; between two looks an extreme is off by a 16² of it
-LEAST_STEPS = 10  # of an output interval with noise, where no estimate of the error shortens a step
+LOOKS = 16  # evaluations of a tube's functions per output interval; an extreme is off by 1/16² of its change
+LEAST_STEPS = 10  # per output interval with noise, where no error estimate shortens a step
 TREE = 64  # the shortest step over the tolerance of the Brownian tree, below which w is interpolated
-DEEPEST = 2**30  # the duration over that tolerance, at most: each halving is one level of the tree in every step
-CHECKPOINTS = 8  # of one interval in reverse mode: its steps are made a second time, and of 45 and more a third
-BRACKET = 4  # units in the last place, of the bracket around the time at which a path meets a boundary
+DEEPEST = 2**30  # the largest duration over that tolerance: each halving adds a level of the tree to every step
+CHECKPOINTS = 8  # per interval in reverse mode: its steps are computed twice, and three times from 45 steps on
+BRACKET = 4  # units in the last place: the width of the bracket around the time at which a path meets a boundary
 
 
 @pytree_dataclass(static=("max_steps", "held"))
@@ -63,7 +63,7 @@ class Stepping:
       atol: absolute error of an internal step, in the units of the state and of the cost.
       max_step: the longest internal step, may be inf.
       max_steps: the most internal steps.
-      held: True where the control is held from one output time to the next.
+      held: True if the control is held from one output time to the next.
     """
 
     rtol: Number
@@ -81,7 +81,7 @@ class InitialValueProblem:
       loop: the closed loop.
       x0: the state at the first time, shape (n,).
       times: output times, shape (k+1,), increasing.
-      key: of the Brownian path; None without noise.
+      key: the key of the Brownian path; None without noise.
     """
 
     loop: Loop
@@ -91,17 +91,17 @@ class InitialValueProblem:
 
 
 def integrate(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Path, jax.Array]:
-    """The path of full length, and a mask (k,) of the intervals that it runs through.
+    """The path of full length, and a mask (k,) of the intervals through which it runs.
 
-    One diffrax solve an output interval, all in one scan; a path that has ended gets intervals of length zero. In
-    reverse mode the state at every output time is kept, and one interval's steps at a time.
+    One diffrax solve per output interval, all in one scan; after the end of a path its intervals have length zero. In
+    reverse mode the state at every output time is stored, and the steps of one interval at a time.
     """
     along, back = (functools.partial(_integrated, reverse=reverse) for reverse in (False, True))
     return with_both_modes(along, back)((ivp, stepping))
 
 
 def _integrated(given: tuple[InitialValueProblem, Stepping], reverse: bool) -> tuple[Path, jax.Array]:
-    """The path of full length, and its mask, by a program for forward or for reverse mode."""
+    """The path of full length and its mask, computed by a program for forward or for reverse mode."""
     interval, first = _intervals(*given, reverse)
     interval = jax.checkpoint(interval, prevent_cse=False) if reverse else interval
     last, rows = jax.lax.scan(interval, first, given[0].times[1:])
@@ -109,7 +109,7 @@ def _integrated(given: tuple[InitialValueProblem, Stepping], reverse: bool) -> t
 
 
 def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple]:
-    """The state before the first interval, but for its code, and empty rows for all intervals; NumPy."""
+    """The state before the first interval, without its code, and empty rows for all intervals; NumPy arrays."""
     count, players = len(times) - 1, (loop.problem.controls, loop.problem.disturbances)
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
     controls, disturbances = (np.zeros((count, size), x0.dtype) for size in inputs)
@@ -121,18 +121,18 @@ def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, 
 def integrate_part(
     ivp: InitialValueProblem, stepping: Stepping, so_far: tuple[Progress, Rows], done: Number, until: Number
 ) -> tuple[tuple[Progress, Rows], tuple[Path, jax.Array]]:
-    """The path so far, after the intervals from ``done`` to before ``until``, beside the record to go on from.
+    """The path after the intervals from ``done`` to before ``until``, and the record from which to continue.
 
     Args:
       ivp: the initial-value problem of the whole path.
-      stepping: how the whole path is integrated.
+      stepping: the steps of the whole path.
       so_far: the record, that is the state and the rows of the intervals before; at first ``blank_record``.
       done: the first interval.
       until: the interval after the last one.
     """
     interval, first = _intervals(ivp, stepping)
     state, rows = so_far
-    # the first code asks the target and the box: here, where functions of the user's are compiled, not at the host
+    # the first code evaluates the target and the box inside the compiled program, not on the host
     state = jax.tree.map(lambda old, new: jnp.where(done == 0, new, old), state, first)
 
     def one(k: jax.Array, carry: tuple[Progress, Rows]) -> tuple[Progress, Rows]:
@@ -151,7 +151,7 @@ def integrate_part(
 
 
 def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = False) -> tuple[Callable, Progress]:
-    """One output interval as a step of a scan, and the state (t, y, code, steps) before the first."""
+    """One output interval as a step of a scan, and the state (t, y, code, steps, extremes) before the first."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     solve = _solver(ivp, stepping, reverse)
 
@@ -159,23 +159,23 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
         t, y, code, count, extremes = state
         u, d = loop.players(t, y[:-1])
         code = jnp.where((code == PathStatus.DURATION) & ~are_finite((u, d)), PathStatus.UNDEFINED, code)
-        active = code == PathStatus.DURATION  # while all is well the code is that of a path which lasts to its end
+        active = code == PathStatus.DURATION  # the status of a path that has not ended yet
         times = (t, jnp.where(active, end, t), ivp.times[-1])
         later, moved, result, made, seen = _advance(loop, stepping, solve, times, y, u)
         count = count + made
         code = jnp.where(active, result, code)
         code = jnp.where((code == PathStatus.DURATION) & (count >= stepping.max_steps), PathStatus.MAX_STEPS, code)
-        active &= jnp.all(jnp.isfinite(moved))  # if not, the path ends at the last output time before
+        active &= jnp.all(jnp.isfinite(moved))  # otherwise the path ends at the previous output time
         t, y = jnp.where(active, later, t), jnp.where(active, moved, y)
         if is_tube(loop.problem):
             extremes = jnp.where(active, _extremes(loop, start, seen, extremes), extremes)
         shown = jax.tree.map(lambda a: jnp.where(active, a, jnp.nan), (u, d))
         return (t, y, code.astype(jnp.int32), count, extremes), (t, y[:-1], *shown, active)
 
-    # the target comes last and wins: a start in both a target and beyond the edge has arrived
+    # the target comes last and wins: a start that is in the target and outside the box has reached the target
     code = jnp.where(loop.margin(x0) > 0, PathStatus.DURATION, PathStatus.LEFT_BOX)
     code = jnp.where(loop.target(start, x0) <= 0, PathStatus.TARGET, code).astype(jnp.int32)
-    # before anything is seen: no moment to stop, and no maximum
+    # before any point: no moment to stop, and no maximum
     extremes = jnp.asarray([jnp.inf, -jnp.inf], x0.dtype)
     if is_tube(loop.problem):
         extremes = _extremes(loop, start, (start[None], x0[None]), extremes)
@@ -188,8 +188,8 @@ def _extremes(loop: Loop, start: Number, seen: tuple[Array, Array], before: jax.
     Args:
       loop: the closed loop.
       start: the first time of the path, where discounting starts.
-      seen: times (k,) and states (k, n), in their order.
-      before: the two numbers before.
+      seen: times (k,) and states (k, n), in order.
+      before: the two numbers so far.
     """
     problem, (best, most) = loop.problem, before
     times, states = seen
@@ -208,12 +208,12 @@ def _extremes(loop: Loop, start: Number, seen: tuple[Array, Array], before: jax.
 
 
 def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: Rows) -> tuple[Path, jax.Array]:
-    """The path of full length from its last state and the rows of its intervals, and a mask of those that it ran."""
+    """The path of full length from its last state and the rows of its intervals, and a mask of its intervals."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count, extremes), (later, states, controls, disturbances, active) = last, shown
     hit, ended = code == PathStatus.TARGET, code == PathStatus.DURATION
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
-    # a path that ends by leaving or failing owes nothing
+    # a path that leaves the box or fails pays nothing at its end
     due = jnp.where(hit, loop.paid_at_end(t, y[:-1]), loop.paid_at_last(t, y[:-1]))
     due, owes = loop.discount(t - start) * due, hit | (ended & _has_last_payment(loop))
     if is_tube(loop.problem):
@@ -228,27 +228,27 @@ def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: R
 
 
 def _has_last_payment(loop: Loop) -> bool:
-    """True if something is due after the last time, be it zero."""
+    """True if there is a payment after the last time, even if it is zero."""
     return loop.due == "V at the horizon" or (loop.due == "terminal cost" and loop.problem.terminal_cost is not None)
 
 
 def _advance(
     loop: Loop, stepping: Stepping, solve: Callable, times: tuple[jax.Array, ...], y: jax.Array, u: Control
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
-    """The path at the end of an interval, or at the target or the edge if they come first.
+    """The path at the end of an interval, or at the target or the boundary if it meets one of them earlier.
 
     Returns:
-      Time, state with cost, code, steps, and the times (k,) and states (k, n) of what a tube sees of the interval.
+      Time, state with cost, code, steps, and the times (k,) and states (k, n) at which a tube is evaluated.
     """
     import diffrax
 
-    t, end, last = times  # of the interval, and the last of all
-    # under vmap a step of a path that is over is worked out, too, and may not go beyond the Brownian path
+    t, end, last = times  # start and end of the interval, and the last of all times
+    # under vmap steps of a finished path are computed too, and must not go beyond the Brownian path
     width = jnp.where(end > t, end - t, jnp.where(last > t, last - t, 1))
     if loop.problem.noise is None:
         step = jnp.minimum(width, stepping.max_step)
     else:
-        # equal steps that end on the output time; the 1e-6 forgives a quotient that rounding lifts over an integer
+        # equal steps that end on the output time; 1e-6 absorbs a quotient that rounding puts just above an integer
         step = width / jnp.ceil(jnp.maximum(width / stepping.max_step, LEAST_STEPS) - 1e-6)
     beginning = (u, t, y[:-1])
     looks, saved = _looks(loop, t, end)
@@ -261,17 +261,17 @@ def _advance(
         y, met = y[:-1], (y[-1] < 1) & diffrax.is_event(solved.result)
         y = jnp.append(jnp.where(met, _on_target(loop, stepping, later, y[:-1], beginning), y[:-1]), y[-1])
     target, margin = loop.target(later, y[:-1]), loop.margin(y[:-1])
-    # the codes are laid over one another from the weakest reason to the strongest, each `where` overrules those before
+    # the codes are written from the weakest reason to the strongest; each `where` overrides the earlier ones
     code = jnp.where(met | (target <= margin), PathStatus.TARGET, PathStatus.LEFT_BOX)
     if loop.guarded and not stepping.held:
         inside = (target > 0) & (margin > 0)
         code = jnp.where(inside & ~met & ~are_finite(loop.players(later, y[:-1])), PathStatus.UNDEFINED, code)
     code = jnp.where(diffrax.is_event(solved.result), code, PathStatus.DURATION)
     code = jnp.where(jnp.all(jnp.isfinite(y)), code, PathStatus.NONFINITE)
-    # diffrax hands back infinity where it ran out of steps, and the state need not have been
+    # diffrax returns infinity if it runs out of steps, although the state may be finite
     code = jnp.where(diffrax.is_okay(solved.result), code, PathStatus.MAX_STEPS)
     seen = later[None], y[None, :-1]
-    if looks:  # behind the end of the path, diffrax has infinity
+    if looks:  # after the end of the path, diffrax fills in infinity
         came = (between[0] <= later) & jnp.all(jnp.isfinite(passed[0]), axis=-1)
         seen = jnp.where(came, between[0], later), jnp.where(came[:, None], passed[0][:, : y.size - 1], y[:-1])
         seen = jnp.append(seen[0], later), jnp.concatenate([seen[1], y[None, :-1]])
@@ -279,7 +279,7 @@ def _advance(
 
 
 def _looks(loop: Loop, t: jax.Array, end: jax.Array) -> tuple[bool, "diffrax.SaveAt"]:
-    """True if a tube sees the path between output times, which it does without noise; and what diffrax is to save."""
+    """True if a tube is evaluated between output times, which requires no noise; and what diffrax is to save."""
     import diffrax
 
     last = diffrax.SubSaveAt(t1=True)
@@ -290,14 +290,14 @@ def _looks(loop: Loop, t: jax.Array, end: jax.Array) -> tuple[bool, "diffrax.Sav
 
 
 def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Callable:
-    """diffrax's solve of one interval, with all that no interval changes; ``args`` are the interval's ``Beginning``.
+    """diffrax's solve of one interval, with all fixed arguments; its ``args`` are the interval's ``Beginning``.
 
-    ``reverse``: with checkpoints, for reverse mode; else for forward mode.
+    ``reverse``: True for checkpoints and reverse mode, False for forward mode.
     """
     import diffrax
 
     loop, x0, start, duration = ivp.loop, ivp.x0, ivp.times[0], ivp.times[-1] - ivp.times[0]
-    n, bridged = len(x0), _is_bridged(loop)  # behind the n states the cost, and then the flag of a bridge
+    n, bridged = len(x0), _is_bridged(loop)  # after the n states come the cost and then the flag of a bridge
 
     def rate(t: Number, y: Array, beginning: Beginning) -> jax.Array:
         acts = _acting(loop, stepping, t, y[:n], beginning)
@@ -309,16 +309,16 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
 
     def margin(t: Number, y: Array, args: Beginning, **kwargs: object) -> jax.Array:
         inside = jnp.minimum(loop.target(t, y[:n]), loop.margin(y[:n]))
-        if loop.guarded and not stepping.held:  # under a hold the players are asked at its samples only
+        if loop.guarded and not stepping.held:  # under a hold the players are only evaluated at the samples
             inside = jnp.where(are_finite(loop.players(t, y[:n])), inside, jnp.minimum(inside, -1))
-        return jnp.where(y[-1] < 1, y[-1], inside) if bridged else inside  # below 1 in a step that meets the target
+        return jnp.where(y[-1] < 1, y[-1], inside) if bridged else inside  # below 1 if the step meets the target
 
     terms: diffrax.AbstractTerm = diffrax.ODETerm(rate)
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
     if loop.problem.noise is None:
         solver = diffrax.Tsit5()
-        # the shortest step is taken whatever its error (force_dtmin), and half of max_steps such steps reach the end
+        # force_dtmin accepts the shortest step for any error; half of max_steps such steps reach the end
         controller = diffrax.PIDController(
             rtol=stepping.rtol, atol=stepping.atol, dtmin=2 * duration / stepping.max_steps, dtmax=stepping.max_step,
             force_dtmin=True, norm=_size,
@@ -327,14 +327,14 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
         additive = not callable(loop.problem.noise)
         brownian = _brownian(ivp, stepping.max_step, additive)
         terms = diffrax.MultiTerm(terms, diffrax.ControlTerm(noise, brownian))
-        # SRA1 has its order for additive noise alone; a function may depend on the state, and is not asked
+        # SRA1 has its order only for additive noise; a function may depend on the state, so it uses Euler
         kind, controller = diffrax.SRA1 if additive else diffrax.Euler, diffrax.ConstantStepSize()
         solver = bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
     event = None
     ends = loop.guarded or loop.ends or (loop.grid is not None and not loop.clamp)
-    if ends:  # it doubles the compile time
+    if ends:  # an event doubles the compile time
         close = BRACKET * jnp.finfo(x0.dtype).eps
-        # flip=True: the function falls through zero. "detect" would put a host callback into the compiled run.
+        # flip=True: the function falls through zero; "detect" would put a host callback into the compiled program
         event = diffrax.Event(margin, _bisection()(close, close, flip=True), direction=False)
     return functools.partial(
         diffrax.diffeqsolve, terms, solver, stepsize_controller=controller, event=event,
@@ -349,13 +349,13 @@ def _is_bridged(loop: Loop) -> bool:
 
 
 def _acting(loop: Loop, stepping: Stepping, t: Number, x: State, beginning: Beginning) -> Actions:
-    """What both players do at a stage of a step."""
+    """The actions of both players at a stage of a step."""
     u, d = loop.actions(t, x, beginning[1:])
     return (beginning[0] if stepping.held else u), d
 
 
 def _on_target(loop: Loop, stepping: Stepping, t: Number, x: State, beginning: Beginning) -> State:
-    """The state in which a path meets the target, from the one on the straight way between the ends of the step."""
+    """The state at which a path meets the target, from a point on the straight line between the ends of the step."""
     sigma = loop.noise(t, x, *_acting(loop, stepping, t, x, beginning))[:-1]
     return onto_edge(functools.partial(loop.target, t), x, sigma)
 
@@ -377,10 +377,10 @@ def _brownian(ivp: InitialValueProblem, max_step: Number, additive: bool) -> "di
 
     loop, x0, times = ivp.loop, ivp.x0, ivp.times
     start, duration = times[0], times[-1] - times[0]
-    # Below its tolerance the tree interpolates, which is not Brownian: keep that far below a step (of 1/10 interval
-    # or less), but one for the whole run, so that neighbouring intervals agree on w, and at most 30 levels deep.
+    # Below its tolerance the tree interpolates and is not Brownian. Keep the tolerance far below a step (at most 1/10
+    # interval), equal for the whole run so that neighbouring intervals agree on w, and at most 30 levels deep.
     fine = jnp.maximum(jnp.minimum(jnp.min(jnp.diff(times)) / LEAST_STEPS, max_step) / TREE, duration / DEEPEST)
-    # SRA1 wants the integral of w over a step beside its increment
+    # SRA1 needs the integral of w over a step in addition to its increment
     area = diffrax.SpaceTimeLevyArea if additive else diffrax.BrownianIncrement
     sources = jax.eval_shape(lambda x: loop.noise(start, x, *loop.players(start, x)), x0).shape[1]
     shape = jax.ShapeDtypeStruct((sources,), x0.dtype)
@@ -388,17 +388,17 @@ def _brownian(ivp: InitialValueProblem, max_step: Number, additive: bool) -> "di
 
 
 def _size(error: jax.Array) -> jax.Array:
-    """The root mean square of a scaled error; infinite for NaN, from which diffrax would make a step of NaN."""
+    """The root mean square of a scaled error; infinite for NaN, because diffrax would make the step length NaN."""
     size = jnp.sqrt(jnp.mean(jnp.square(error)))
     return jnp.where(jnp.isnan(size), jnp.inf, size)
 
 
 @functools.cache
 def _bisection() -> type:
-    """The class of optimistix's bisection, stopped by the width of its bracket alone.
+    """The class of optimistix's bisection that stops only by the width of its bracket.
 
-    A target function may be steep, or jump: a test of its value would never be met, or met too early.
-    The answer is the late end of the bracket, where the function has fallen to zero or below.
+    A target function may be steep or jump, so a test of its value would fail or succeed too early. The answer is the
+    late end of the bracket, where the function is zero or below.
     """
     import optimistix
 

@@ -2,16 +2,17 @@
 
     ∫ L(x, u, 0) dt ≤ ∫ [L(x, u, 0) − L(x, u, d)] dt + V(x₀)    for every d, with u the feedback of the solution.
 
-For the cost ½|z|² − ½γ²|d|² of an L₂ gain this is half of ∫|z|² ≤ γ²∫|d|² + β₀(x₀) with β₀ = 2V: the left side is the
-energy of the output, the integral on the right what the disturbance supplies, V what is stored at the start. It holds
-up to any time, since V ≥ 0 is left at its end. The worst disturbance takes it to equality as time goes on, a random one
-leaves a margin. V and u are those of a grid: the margin of the worst case may be below zero by their error, and where
-the set of disturbances was felt (see ``saturation``) nothing is claimed of wider ones.
+For the cost ½|z|² − ½γ²|d|² of an L₂ gain this is half of ∫|z|² ≤ γ²∫|d|² + β₀(x₀) with β₀ = 2V. The left side is the
+energy of the output, the integral on the right is the energy that the disturbance supplies, and V is the energy stored
+at the start. The inequality holds for any final time, since V ≥ 0 at the end. Under the worst disturbance it becomes an
+equality as time goes on; a random disturbance leaves a margin. V and u have discretisation errors, so the margin of the
+worst case may be negative by their size. If the bounds on the disturbances were active (see ``saturation``), the result
+says nothing about larger disturbances.
 
-Both integrals are made by the integrator of ``simulate``, with its accuracy. Random disturbances run linearly between
-independent points at equally spaced times; those are uniform in the set times a strength, which goes from .01 to 1, so
-that they are neither all weak nor all so strong that the inequality says nothing. A box without 0 is scaled about its
-point nearest to 0, so that they stay in it.
+The integrator of ``simulate`` computes both integrals to its accuracy. Random disturbances are linear between
+independent points at equally spaced times. The points are uniform in the set, scaled by a strength between 0.01 and 1,
+so that the disturbances are neither all weak nor all so strong that the inequality is trivial. A box without 0 is
+scaled about its point nearest to 0, so that the disturbances stay in it.
 """
 
 import dataclasses
@@ -33,21 +34,21 @@ from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.solution import Solution
 from hjbjax.tracing import closures
 
-POINTS = 33  # of a random disturbance
-STEPS = 64  # output intervals of a path: two between neighbouring points, so that no step runs over a kink
-WEAKEST = 0.01  # random disturbance over the set
+POINTS = 33  # per random disturbance
+STEPS = 64  # output intervals per path: two between neighbouring points, so that no step crosses a kink
+WEAKEST = 0.01  # strength of the weakest random disturbance relative to the set
 
 Energies: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # output, whole cost, last state, PathStatus
 
 
 @pytree_dataclass()
 class Lanes:
-    """Paths under the worst case or under a random signal, one row a path.
+    """Paths under the worst case or under a random signal, one row per path.
 
     Args:
       starts: x₀, shape (p, n).
-      weights: of the worst case, shape (p,): 1 or 0.
-      points: what the signal beside it goes through, shape (p, POINTS, l).
+      weights: the weight of the worst case, shape (p,): 1 or 0.
+      points: the points of the added signal, shape (p, POINTS, l).
     """
 
     starts: Array
@@ -57,16 +58,16 @@ class Lanes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Dissipation:
-    """Energies along paths, one entry a path, in cost units (halves of squares where the cost is ½|z|² − ½γ²|d|²).
+    """Energies along paths, one entry per path, in cost units (halves of squares for the cost ½|z|² − ½γ²|d|²).
 
     Args:
       starts: x₀, shape (p, n).
       disturbances: "worst case", "random" or "given", p words.
       output: the energy of the output, ∫ L(x, u, 0) dt, shape (p,).
-      supplied: what the disturbance supplies, ∫ [L(x, u, 0) − L(x, u, d)] dt, shape (p,).
+      supplied: the energy supplied by the disturbance, ∫ [L(x, u, 0) − L(x, u, d)] dt, shape (p,).
       stored: V(x₀), shape (p,).
       ends: the state at the end, shape (p, n).
-      statuses: why each path ends.
+      statuses: the reason why each path ends.
     """
 
     starts: np.ndarray
@@ -79,12 +80,12 @@ class Dissipation:
 
     @property
     def margin(self) -> np.ndarray:
-        """stored + supplied − output, shape (p,): ≥ 0 where the inequality holds; NaN where a path broke off."""
+        """stored + supplied − output, shape (p,): ≥ 0 if the inequality holds; NaN if the path failed."""
         return self.stored + self.supplied - self.output
 
     @property
     def worst(self) -> float:
-        """The smallest margin; NaN if one is."""
+        """The smallest margin; NaN if any margin is NaN."""
         return float(np.min(self.margin))
 
     def __str__(self) -> str:
@@ -113,17 +114,17 @@ def dissipation(
     """Check ∫|z|² ≤ γ²∫|d|² + β₀(x₀) along paths with the worst, with random and with given disturbances.
 
     Args:
-      problem: the game, with cost ½|z|² − ½γ²|d|² or like it.
-      solution: its stationary solution, such as ``hinf_level(...).solution``, which brings V, feedback and worst case.
-      x0s: where paths start, shape (k, n), or (n,) for one; in the grid.
-      duration: how long each runs, in units of time, unless it leaves the grid before.
+      problem: the game, with a cost such as ½|z|² − ½γ²|d|².
+      solution: its stationary solution, such as ``hinf_level(...).solution``, with V, feedback and worst case.
+      x0s: the initial states, shape (k, n), or (n,) for one; inside the grid.
+      duration: the length of each path, in units of time, unless it leaves the grid earlier.
       disturbances: more signals, functions (t, x) -> (l,).
-      random: how many random disturbances from each start; 0 for those of a finite set.
+      random: the number of random disturbances per initial state; must be 0 for a finite set.
       key: a JAX random key or an integer.
       rtol: relative error of an internal step.
 
     Returns:
-      The energies of k (1 + random + given) paths and their margins; ``print`` shows the tightest of each kind.
+      The energies of k (1 + random + given) paths and their margins; ``print`` shows the tightest margin of each kind.
 
     Raises:
       ValueError: no disturbances, random ones of a finite set, noise, a marched solution, or starts outside the grid.
@@ -139,7 +140,7 @@ def dissipation(
     """
     starts = _check(problem, solution, x0s, duration, disturbances, random)
     key = arguments.random_key(key, "dissipation: key")
-    import diffrax  # noqa: F401  # before anything is compiled, see simulate
+    import diffrax  # noqa: F401  # before the first compilation, see simulate
 
     with own_settings(x64=True):  # the margin is a difference of energies, near zero in the worst case
         n = starts.shape[1]
@@ -152,9 +153,9 @@ def dissipation(
             found.append(_energies_under(problem, solution, given, starts, times, rtol))
         output, total, ends, codes = (np.concatenate(each) for each in zip(*jax.device_get(found), strict=True))
         stored = np.asarray(solution.value_at(starts))
-    count = len(output) // len(starts)  # paths of each start; all starts come in turn under each disturbance
+    count = len(output) // len(starts)  # paths per initial state; all initial states follow under each disturbance
     statuses = tuple(PathStatus(int(code)) for code in codes)
-    # a path that came to no finite state ends at the one before, whose energies say nothing of the rest
+    # a path that becomes infinite ends at its last finite state, whose energies do not cover the whole duration
     output = np.where([status is PathStatus.NONFINITE for status in statuses], np.nan, output)
     return Dissipation(
         np.tile(starts, (count, 1)),
@@ -171,13 +172,13 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple
     """The paths with the worst case and with random disturbances, in this order, and the kind of each."""
     admissible, count = problem.disturbances, random * len(starts)
     assert admissible is not None
-    # equally spaced in the logarithm: each decade down to WEAKEST gets its share, the last is the whole set
+    # equally spaced in the logarithm: each decade down to WEAKEST gets its share, and the last covers the whole set
     strength = np.geomspace(WEAKEST, 1.0, random) if random > 1 else np.ones(random)
     # the point of the set nearest to 0, about which the set is scaled
     least = np.clip(0.0, admissible.lo, admissible.hi) if isinstance(admissible, Box) else np.zeros(admissible.dim)
     away = np.zeros((0, POINTS, admissible.dim))
     if count:
-        assert not isinstance(admissible, Finite)  # refused, where random ones are asked for
+        assert not isinstance(admissible, Finite)  # refused together with random > 0
         away = np.asarray(_sample(admissible, key, (count, POINTS))) - least
     points = least + np.repeat(strength, len(starts))[:, None, None] * away
     still = np.zeros((len(starts), POINTS, admissible.dim))
@@ -195,11 +196,11 @@ def _sample(admissible: Box | Ball, key: Key, shape: tuple[int, ...]) -> jax.Arr
 
 def _disturbance(look: Callable, weight: Number, points: Array, duration: Number, t: Number, x: State) -> Array:
     """The worst case times ``weight``, plus a signal that is linear between its points."""
-    # by index and share, as the points are equally spaced; at the end of the path the last cell goes on
+    # by index and share, since the points are equally spaced; the last cell extends past the end of the path
     place = jnp.clip(t / duration, 0, 1) * (POINTS - 1)
     cell = jnp.clip(jnp.floor(place).astype(int), 0, POINTS - 2)
     signal = points[cell] + (place - cell) * (points[cell + 1] - points[cell])
-    # weight 0 times NaN, where the solution knows no worst case, would be NaN
+    # nan_to_num, because weight 0 times NaN, where the solution knows no worst case, would be NaN
     return weight * jnp.nan_to_num(look(x, clamp=True)) + signal
 
 
@@ -226,14 +227,14 @@ def _energies(problem: Problem, solution: Solution, lanes: Lanes, times: Array, 
 def _energies_under(
     problem: Problem, solution: Solution, signal: Callable, starts: Array, times: Array, rtol: Number
 ) -> Energies:
-    """The energies of the paths from all starts under one signal of the user's."""
+    """The energies of the paths from all starts under one user-supplied signal."""
     return jax.vmap(lambda start: _path_energies(problem, solution, signal, start, times, rtol))(starts)
 
 
 def _path_energies(
     problem: Problem, solution: Solution, opponent: Callable, start: State, times: Array, rtol: Number
 ) -> Energies:
-    """The energies of one path, which is integrated twice side by side: an integrator carries one running cost."""
+    """The energies of one path, integrated twice side by side, because an integrator carries one running cost."""
 
     def run(share: jax.Array) -> Path:
         measured = dataclasses.replace(problem, cost=jax.tree_util.Partial(_running_cost, problem.cost, share))
@@ -251,7 +252,7 @@ def _check(
     signals: Sequence[object],
     random: object,
 ) -> np.ndarray:
-    """The starts, shape (k, n), once it is known that there is an inequality to check along these paths."""
+    """The initial states, shape (k, n), after checks that the inequality applies to these paths."""
     if is_traced(problem, solution, x0s):
         raise ValueError("dissipation: it runs at host level only, outside of jit, vmap and grad")
     if problem.disturbances is None or solution.disturbance is None or problem.cost is None:
@@ -263,11 +264,11 @@ def _check(
     if isinstance(duration, bool) or not isinstance(duration, (int, float)) or not 0 < duration < np.inf:
         raise ValueError(f"dissipation: duration is {duration!r}, wanted a finite number > 0")
     if isinstance(random, bool) or not isinstance(random, int) or random < 0:
-        raise ValueError(f"dissipation: random is {random!r}, wanted how many, an integer ≥ 0")
+        raise ValueError(f"dissipation: random is {random!r}, wanted the number of random disturbances, an integer ≥ 0")
     if random and isinstance(problem.disturbances, Finite):
         raise ValueError(
-            f"dissipation: the disturbances are {len(problem.disturbances.points)} points, between which random ones "
-            "would run; wanted a Box or a Ball, or random=0"
+            f"dissipation: the disturbances are {len(problem.disturbances.points)} points, and random ones would run "
+            "between them; wanted a Box or a Ball, or random=0"
         )
     for signal in signals:
         if not callable(signal):
@@ -276,5 +277,5 @@ def _check(
     if starts.ndim != 2 or starts.shape[1] != solution.grid.ndim:
         raise ValueError(f"dissipation: x0s has shape {np.shape(x0s)}, wanted (k, {solution.grid.ndim})")
     if np.any(solution.grid.beyond(starts)) or not np.all(np.isfinite(solution.value_at(starts))):
-        raise ValueError("dissipation: a start lies outside the grid, or where the value is not finite; start inside")
+        raise ValueError("dissipation: a start is outside the grid, or where the value is not finite; start inside")
     return starts

@@ -2,10 +2,9 @@
 
     u(x) = argmin_u max_d [ L(x, u, d) + f(x, u, d)·DV(x) + ½ tr(σσᵀ(x, u, d) D²V(x)) ]
 
-with DV the interpolated central differences of ``costate_at`` and D²V from V one cell away, which beyond an end of the
-box goes on as the scheme has it: mirrored at a wall, on a parabola at an open end. Where a control jumps
-between two nodes, their mean is optimal for neither, and of an enumerated set not even a member; the minimiser jumps
-with DV.
+DV is interpolated from the central differences of ``costate_at``. D²V uses V one cell away, which is extended beyond an
+end of the box as the scheme does: mirrored at a wall, by a parabola at an open end. If a control jumps between two
+nodes, their mean is optimal for neither, and may not even belong to an enumerated set. The minimiser jumps with DV.
 """
 
 import dataclasses
@@ -36,14 +35,14 @@ from hjbjax.tracing.closures import settled
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
-FEWEST = 10  # intervals between kept times that a marched feedback must have over a path
-ROUNDING = 1e-9  # relative, of times: one of two that are compared may be a sum of steps
+FEWEST = 10  # intervals between stored times that a marched feedback needs over a path
+ROUNDING = 1e-9  # relative tolerance for comparing times, which may be sums of steps
 
-Place: TypeAlias = Numbers | Sequence  # a state, shape (n,) or (..., n), or the time that goes before it
+Place: TypeAlias = Numbers | Sequence  # a state, shape (n,) or (..., n), or the time that precedes it
 
 
 class GridFeedback(Protocol):
-    """Both players on a grid, looked up between its nodes, as a Solution or a ``greedy_feedback`` has them."""
+    """Both players on a grid, interpolated between its nodes: a Solution or a ``greedy_feedback``."""
 
     @property
     def grid(self) -> Grid:
@@ -51,67 +50,67 @@ class GridFeedback(Protocol):
 
     @property
     def times(self) -> Array | None:
-        """The kept times of a march; None of a stationary feedback."""
+        """The stored times of a march; None for a stationary feedback."""
 
     @property
     def disturbance(self) -> Array | None:
-        """Not None exactly where the worst case is known."""
+        """Not None if and only if the worst case is known."""
 
     @property
     def control_at(self) -> Callable[..., Array]:
-        """The control at (x), of a marched one at (t, x); with the keyword ``clamp``."""
+        """The control at (x), or at (t, x) for a marched feedback; with the keyword ``clamp``."""
 
     @property
     def disturbance_at(self) -> Callable[..., Array]:
-        """The opponent's action there."""
+        """The opponent's action at the same arguments."""
 
 
 def is_grid_feedback(feedback: object) -> "TypeIs[GridFeedback]":
-    """True for a Solution and for what answers as one does, False for a plain function of the state."""
+    """True for a Solution and other objects with ``control_at``, False for a plain function of the state."""
     return hasattr(feedback, "control_at")
 
 
 def check_kept(solution: GridFeedback, duration: float, name: str) -> float:
-    """Refuse a marched feedback that is not known well enough up to the duration.
+    """Refuse a marched feedback that is not stored at enough times up to the duration.
 
     Args:
-      solution: a marched solution, its times known numbers.
-      duration: how long it is to act, from t = 0.
-      name: who asks and what it calls the duration, for refusals.
+      solution: a marched solution whose times are known numbers.
+      duration: the length of the path, from t = 0.
+      name: the function the user called and its name for the duration, for messages.
 
     Returns:
-      The horizon up to which it was marched.
+      The horizon of the march.
 
     Raises:
-      ValueError: the kept times end before, or are too far apart.
+      ValueError: the stored times end too early or are too far apart.
     """
     times = np.asarray(solution.times, np.float64)
     horizon = float(getattr(solution, "stats", {}).get("horizon", times[-1]))
     if duration > horizon * (1 + ROUNDING):
         raise ValueError(f"{name} = {duration:g} goes beyond the horizon {horizon:g} of the solution; shorten it")
-    # between two kept times the feedback is linear: with the two ends among them, no gap may be wider than a tenth
+    # the feedback is linear between two stored times: no gap, including both ends, may be wider than a tenth
     between = np.concatenate([[0.0], times[(times > 0) & (times < duration)], [duration]])
     gap = float(np.max(np.diff(between)))
     if times[0] > 0 or times[-1] < duration * (1 - ROUNDING) or gap > duration / FEWEST * (1 + ROUNDING):
         raise ValueError(
-            f"{name} = {duration:g}, but the solution was marched and kept at {times.size} times from {times[0]:g} to "
-            f"{times[-1]:g}; a feedback up to t = {duration:g} wants all of that covered,\n"
+            f"{name} = {duration:g}, but the solution was marched and stored at {times.size} times from {times[0]:g} "
+            f"to {times[-1]:g}; a feedback up to t = {duration:g} needs times over that whole range,\n"
             f"at most {duration / FEWEST:g} apart: march(..., times=np.linspace(0, {horizon:g}, 41))"
         )
     return horizon
 
 
 def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
-    """The control and the disturbance of a Solution, or of what answers as one does, as functions of (t, x).
+    """The control and the disturbance of a GridFeedback as functions of (t, x).
 
-    A state outside the target may lie in a cell whose nodes are all in it, as beside a hollow one. There the nodes
-    around the cell answer.
+    A state outside the target may be in a cell whose nodes are all inside, for example next to a hollow target. There
+    the surrounding nodes are used.
     """
     answers: list[GridFeedback] = [feedback]
     if isinstance(feedback, Solution):
         players = {"policy": feedback.discrete, "disturbance": feedback.discrete_disturbance}
         given = {name: getattr(feedback, name) for name in players if getattr(feedback, name) is not None}
-        # nodes without a control get that of their neighbours: asked second, they answer where a whole cell is NaN
+        # nodes without a control get their neighbours' control; this is used only where a whole cell is NaN
         filled = {name: extended(feedback.grid, array, players[name]) for name, array in given.items()}
         answers.append(dataclasses.replace(feedback, **filled))
     ask = _look_up if feedback.times is None else _look_up_in_time
@@ -122,12 +121,12 @@ def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
     return control, disturbance
 
 
-# The loop clips every state into the box before it asks; clamp=True, or one on the edge is refused for a rounding.
-# An integrator traces its right-hand side some twenty times; within ``jit`` a lookup is traced once: 1 s in place of 2.
+# The loop clips every state into the box first; clamp=True keeps rounding from refusing a state on the boundary. An
+# integrator traces its right-hand side about twenty times; ``jit`` traces a lookup only once, in 1 s instead of 2 s.
 
 
 def _look_up(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
-    """The first of several lookups at x that is not NaN, whatever the time."""
+    """The first of several lookups at x that is not NaN, for any time."""
     return _first_at(as_jax(looks), x)
 
 
@@ -138,7 +137,7 @@ def _look_up_in_time(looks: tuple[Callable, ...], t: Number, x: State) -> Array:
 
 @functools.partial(jax.jit, inline=True)
 def _first_at(looks: tuple[Callable, ...], *where: Array) -> Array:
-    """The first answer, entry by entry the next one where it is NaN."""
+    """The first lookup, with NaN entries replaced by the next lookup."""
     answer, *others = [look(*where, clamp=True) for look in looks]
     for other in others:
         answer = jnp.where(jnp.isnan(answer), other, answer)
@@ -147,24 +146,24 @@ def _first_at(looks: tuple[Callable, ...], *where: Array) -> Array:
 
 @pytree_dataclass()
 class Greedy:
-    """The feedback of ``greedy_feedback``; called with (x), of a marched solution with (t, x).
+    """The feedback of ``greedy_feedback``; called with (x), or (t, x) for a marched solution.
 
-    It answers as a Solution does, so that ``simulate`` takes its grid, its times and its worst case from it.
+    It has the interface of a Solution, so ``simulate`` takes its grid, its times and its worst case from it.
 
     Args:
-      problem: whose Hamiltonian is minimised.
-      solution: whose value brings the slopes.
+      problem: the problem whose Hamiltonian is minimised.
+      solution: the solution whose value gives the slopes.
     """
 
     problem: Problem
     solution: Solution
 
     def __call__(self, *where: Place) -> Array:
-        """The control, shape (m,); outside the grid that of its nearest point."""
+        """The control, shape (m,); outside the grid the control of its nearest point."""
         return self.control_at(*where, clamp=True)
 
     def control_at(self, *where: Place, clamp: bool = False) -> Array:
-        """The minimising control, shape ``x.shape[:-1] + (m,)``; arguments and refusals as of a Solution's."""
+        """The minimising control, shape ``x.shape[:-1] + (m,)``; arguments and errors as for a Solution."""
         return self._ask(where, clamp)[0]
 
     def disturbance_at(self, *where: Place, clamp: bool = False) -> Array:
@@ -178,7 +177,7 @@ class Greedy:
 
     @property
     def times(self) -> Array | None:
-        """The kept times of a marched solution, or None."""
+        """The stored times of a marched solution, or None."""
         return self.solution.times
 
     @property
@@ -188,13 +187,13 @@ class Greedy:
 
     @property
     def disturbance(self) -> Array | None:
-        """Not None in a game: the nodes' disturbances, which the solution has; they are not looked up."""
+        """Not None in a game: the disturbances of the solution at the nodes, which are not interpolated here."""
         return self.solution.disturbance
 
     def _ask(self, where: tuple[Place, ...], clamp: bool) -> tuple[Array, Array]:
-        """Both players' actions: float64 NumPy from concrete data, else of the tracer's dtype."""
-        costate = self.solution.costate_at(*where, clamp=clamp)  # refuses what is no state
-        if is_traced(costate, self):  # float64 must not be switched on in the middle of somebody's trace
+        """Both players' actions: float64 NumPy arrays for concrete data, otherwise in the tracer's dtype."""
+        costate = self.solution.costate_at(*where, clamp=clamp)  # also checks the state
+        if is_traced(costate, self):  # float64 must not be switched on in the middle of a caller's trace
             with own_settings():
                 return _minimax(as_jax(self), where, costate)
         with own_settings(x64=True):
@@ -207,25 +206,26 @@ def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
     """A feedback that minimises the Hamiltonian at the state, with the slopes of the solution's value there.
 
     u(x) = argmin_u max_d [L + f·DV + ½ tr(σσᵀ D²V)], exact where ``solve`` minimises exactly, and always admissible.
-    The controls of a Solution between the nodes are means of those at the nodes: cheaper, smoother, and not optimal
-    where the control jumps. The path of the minimiser costs V, as far as V is right: of the double integrator, whose V
-    is off by a fifth on 101 x 101 nodes, it is no better than that, but with exact V seven times nearer to the least
-    time than the means. Where the control jumps, give ``simulate`` a sampling interval, ``hold=``: at a switching
-    curve the control then changes at the samples alone, and a path that the curve attracts follows it in a zigzag as
-    wide as a sample; without a hold an adaptive step is cut at every crossing, thousands of times. In the cells at a
-    constrained end it is the solution's own control, which does not leave. NaN where the value has no finite slope.
+    A Solution interpolates the controls of the nodes, which is cheaper and smoother but not optimal where the control
+    jumps. The minimiser's path costs V, up to the error of V. For the double integrator on 101 x 101 nodes, where V is
+    off by a fifth, it is no better than interpolation; with exact V its time is seven times closer to the minimum.
+
+    Where the control jumps, pass a sampling interval ``hold=`` to ``simulate``. The control then changes only at the
+    samples, and a path attracted by a switching curve follows it in a zigzag as wide as a sample. Without a hold an
+    adaptive step is cut at every crossing, thousands of times. In the cells at a constrained end the feedback is the
+    solution's own control, which does not leave the box. NaN where the value has no finite slope.
 
     Args:
-      problem: what was solved; it has controls.
-      solution: what ``solve`` or ``march`` returned for it.
+      problem: the problem that was solved; it must have controls.
+      solution: the result of ``solve`` or ``march``.
 
     Returns:
-      A function of the state, of (t, x) if the solution was marched, that ``jit`` and ``vmap`` accept, a pytree, and
-      a feedback for ``simulate`` and wherever else one is wanted.
+      A function of the state, or of (t, x) if the solution was marched. It is a pytree, supports ``jit`` and ``vmap``,
+      and can be used wherever a feedback is accepted, for example in ``simulate``.
 
     Raises:
-      TypeError: no Problem or no Solution.
-      ValueError: a problem without controls, or a solution on another number of states.
+      TypeError: an argument that is not a Problem or not a Solution.
+      ValueError: a problem without controls, or a solution with another number of states.
 
     Example:
       >>> import hjbjax as hjb
@@ -245,18 +245,18 @@ def greedy_feedback(problem: Problem, solution: Solution) -> Greedy:
         raise ValueError(f"greedy_feedback: the value has shape {np.shape(solution.value)}, wanted {wanted}: no batch")
     m = np.shape(solution.policy)[-1:] if solution.policy is not None else (problem.controls.dim,)
     if m != (problem.controls.dim,) or (problem.is_game and solution.disturbance is None):
-        raise ValueError("greedy_feedback: the solution is not one of this problem; its players are others")
+        raise ValueError("greedy_feedback: the solution belongs to another problem; its players differ")
     return Greedy(settled(problem, solution.grid.ndim), solution)
 
 
 def _minimax(greedy: Greedy, where: tuple, costate: Array) -> tuple[Array, Array]:
-    """Both players' actions at states of shape (..., n), one by one, shapes (..., m) and (..., l)."""
+    """Both players' actions at states of shape (..., n), each state separately, shapes (..., m) and (..., l)."""
     times, shape = where[:-1], jnp.shape(costate)  # the time and the states broadcast to the shape of the costates
     states = jnp.broadcast_to(jnp.asarray(where[-1], costate.dtype), shape).reshape(-1, shape[-1])
     moments = [jnp.broadcast_to(jnp.asarray(t, costate.dtype), shape[:-1]).reshape(-1) for t in times]
     answers = list(jax.vmap(lambda x, p, *t: _at(greedy, t, x, p))(states, costate.reshape(-1, shape[-1]), *moments))
     if greedy.grid.sides("constrained"):
-        # the block around a state has no wall, so that its minimiser may leave; the nodes' own controls do not
+        # the block around a state has no wall, so its minimiser may leave the box; the controls of the nodes do not
         beside = _beside_a_wall(greedy.grid, states)[:, None]
         looks = [greedy.solution.control_at, greedy.solution.disturbance_at][: 1 + greedy.problem.is_game]
         for player, look in enumerate(looks):
@@ -269,7 +269,7 @@ _jit_minimax = jax.jit(_minimax)
 
 
 def _beside_a_wall(grid: Grid, states: Array) -> jax.Array:
-    """A mask (k,) of the states (k, n) that lie in a cell at a constrained end."""
+    """A mask (k,) of the states (k, n) in a cell at a constrained end."""
     found = jnp.zeros(states.shape[:1], bool)
     for axis, step in grid.sides("constrained"):
         nodes = np.arange(grid.shape[axis])[[-2, 1][step < 0]]  # the first node inside, from either end
@@ -283,12 +283,12 @@ def _at(greedy: Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple
     problem, grid = greedy.problem, greedy.grid
     n, t = grid.ndim, (when[0] if when else 0.0)
     x = grid.wrap(x)
-    # clipped as the costate was: outside of the box the Hamiltonian is that of the nearest point
+    # clipped like the costate: outside the box the Hamiltonian of the nearest point is used
     x = jnp.where(np.array(grid.periodic), x, jnp.clip(x, jnp.asarray(grid.lo, x.dtype), jnp.asarray(grid.hi, x.dtype)))
-    # V is looked up one mean cell away, also on a stretched axis: for D²V a cell is the least that the nodes resolve
+    # D²V uses V one mean cell away, also on a stretched axis, because the nodes resolve nothing finer
     widths = [jnp.asarray(grid.spacing(axis), x.dtype) for axis in range(n)]
     h = jnp.stack([jnp.mean(width) for width in widths])
-    # without noise no second difference is asked for, and zeros stand in for V at the 3^n nodes
+    # without noise D²V is not needed, so zeros replace V at the 3^n nodes
     value, bends = jnp.zeros((3,) * n, x.dtype), (jnp.zeros((), x.dtype),) * n
     if problem.noise is not None:
         steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * n, indexing="ij"), axis=-1)
@@ -296,24 +296,24 @@ def _at(greedy: Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple
         look = functools.partial(greedy.solution.value_at, *when, clamp=True)
         value = beyond_ends(look, points, grid, continuing_sides(grid))
         center = (1,) * n
-        # D⁺ − D⁻ along every axis, the second difference times h: the form in which the Hamiltonian takes noise
+        # D⁺ − D⁻ along every axis, the second difference times h, which is how the Hamiltonian takes noise
         bends = tuple(
             sum(value[(*center[:axis], side, *center[axis + 1 :])] - value[center] for side in (0, 2)) / h[axis]
             for axis in range(n)
         )
-    # A block of nodes around the state, of which only the middle one is looked at; no upwinding: both slopes are DV.
+    # a block of nodes around the state, of which only the middle one is used; no upwinding, since both slopes are DV
     block = Grid(x - h, x + h, (3,) * n)
     slopes, links = tuple(p), tuple(Links(width, width) for width in h)
     on = Discretisation(problem, block, Limited(), x.dtype, t)
     hamiltonian = DiscreteHamiltonian(on, list(x), value, slopes, slopes, bends, links)
     _, u, d = optimise(hamiltonian)
-    known = jnp.all(jnp.isfinite(p))  # a minimum over slopes of NaN would still be some admissible action
+    known = jnp.all(jnp.isfinite(p))  # otherwise minimising over NaN slopes would still return an admissible action
     control, disturbance = (jnp.where(known, _middle(action, x.dtype, n), jnp.nan) for action in (u, d))
     return control, disturbance
 
 
 def _reflected(points: jax.Array, grid: Grid) -> jax.Array:
-    """Points (..., n) with those beyond a wall at their mirror image, where noise sees V."""
+    """Points (..., n) with those beyond a wall replaced by their mirror image, as noise is reflected there."""
     for axis, step in grid.sides("projected") + grid.sides("constrained"):
         wall = jnp.asarray((grid.hi if step > 0 else grid.lo)[axis], points.dtype)
         along = points[..., axis]
@@ -322,13 +322,13 @@ def _reflected(points: jax.Array, grid: Grid) -> jax.Array:
 
 
 def beyond_ends(look: Callable, points: jax.Array, grid: Grid, sides: Sequence[tuple[int, int]]) -> jax.Array:
-    """V at points (..., n) that may lie beyond ends where the scheme continues it.
+    """V at points (..., n) that may be beyond an end at which the scheme extends V.
 
-    The node beyond an end has the scheme's own value, see ``stencil.continuation``; V is linear up to there.
+    The node beyond an end has the scheme's own value, see ``stencil.continuation``; V is linear up to that node.
 
     Args:
       look: V inside the box, as a function of points (..., n).
-      points: where.
+      points: the points.
       grid: the nodes.
       sides: the ends, pairs of an axis and a step, in the order of ``continuing_sides``.
     """
@@ -341,11 +341,11 @@ def beyond_ends(look: Callable, points: jax.Array, grid: Grid, sides: Sequence[t
     share = step * (along - inwards[0]) / gap
     outside, total = share > 0, jnp.zeros(points.shape[:-1], points.dtype)
     for k, weight in enumerate(stencil.continuation(grid, axis, step)):
-        inside = 0 if k else 1  # the weight of this node for a point that is not beyond
+        inside = 0 if k else 1  # the weight of this node for a point inside the box
         weight = jnp.where(outside, share * jnp.asarray(weight, points.dtype) + inside * (1 - share), inside)
         place = points.at[..., axis].set(jnp.where(outside, inwards[k], along))
         value = beyond_ends(look, place, grid, further)
-        total = total + jnp.where(weight == 0, 0, weight * value)  # a node without weight has no say, be it infinite
+        total = total + jnp.where(weight == 0, 0, weight * value)  # a node with weight zero may be infinite
     if (end := stencil.sloped(grid, axis, step)) is None:
         return total
     slope = jnp.broadcast_to(jnp.asarray(end.slope, points.dtype), grid.shape)
@@ -354,7 +354,7 @@ def beyond_ends(look: Callable, points: jax.Array, grid: Grid, sides: Sequence[t
 
 
 def continuing_sides(grid: Grid) -> list[tuple[int, int]]:
-    """The ends beyond which V continues: pairs of an axis and a step, −1 lower and 1 upper."""
+    """The ends beyond which the scheme extends V: pairs of an axis and a step, −1 lower and 1 upper."""
     sides = itertools.product(range(grid.ndim), (-1, 1))
     return [side for side in sides if not grid.periodic[side[0]] and not stencil.has_wall(grid, *side)]
 
@@ -363,5 +363,5 @@ def _middle(action: list[Array], dtype: DType, n: int) -> jax.Array:
     """An action at the middle node of the block of 3^n, as one array of shape (m,)."""
     if not action:
         return jnp.zeros(0, dtype)
-    # an input that does not depend on the node comes as a number, one that varies along an axis broadcasts
+    # an input that does not depend on the node is a number; one that varies along an axis broadcasts
     return jnp.stack([jnp.broadcast_to(jnp.asarray(entry, dtype), (3,) * n)[(1,) * n] for entry in action])

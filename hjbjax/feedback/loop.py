@@ -1,17 +1,16 @@
-"""A closed loop at one time and state: what both players do, the drift, the cost, the noise, and where it ends.
+"""A closed loop at one time and state: both players, the drift, the cost, the noise, and the end of a path.
 
-With noise a path also meets its target between two steps: a Brownian bridge, drawn once a step.
-
-What a step of length h shows is the path at its ends, and a path that looks in only there is late by about .58 σ√h:
-mean times are then off by the order ½. Between its ends a step of Euler's is a Brownian bridge. With the target's
-function l ≥ 0 outside, and its distances d = l/|σ'∇l| at the two ends in units of the noise,
+With noise a path can also meet its target between the ends of a step. A step of length h only computes the path at its
+ends. A test only there finds the target too late by about 0.58 σ√h, so mean times would have order ½. Between its ends
+an Euler step is a Brownian bridge, which is sampled once per step. With the target's function l ≥ 0 outside, and its
+distances d = l/|σ'∇l| at the two ends in units of the noise,
 
     P(the bridge meets the target | both ends outside) = exp(−2 d₀d₁/h),
-    τ/(h − τ) ~ inverse Gaussian with mean d₀/|d₁| and shape d₀²/h, where it does; also for d₁ ≤ 0, where it must
+    τ/(h − τ) ~ inverse Gaussian with mean d₀/|d₁| and shape d₀²/h if it meets the target; also if d₁ ≤ 0
 
-is exact for additive noise, a constant drift and a target with a flat edge; else the laws of exit times have the order
-1 of Euler's. The noise may act along the edge alone (∇l'σ = 0, as on the velocity with a target in position): then
-the path has a slope, and the interpolant of the step says when it meets the target.
+is exact for additive noise, constant drift and a target with a flat boundary. Otherwise the laws of exit times have the
+order 1 of the Euler scheme. If the noise acts only along the boundary (∇l'σ = 0, for example noise on the velocity and
+a target in position), the path has a slope, and the interpolant of the step locates the target.
 """
 
 import functools
@@ -31,13 +30,13 @@ from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Disturbance, Key, Number, State
 from hjbjax.tracing import checks, closures
 
-Event: TypeAlias = tuple[Number, State]  # a point of the path: when, and where
-Actions: TypeAlias = tuple[Control, Disturbance | None]  # of both players; no disturbance where there is no opponent
+Event: TypeAlias = tuple[Number, State]  # a point of the path: its time and its state
+Actions: TypeAlias = tuple[Control, Disturbance | None]  # of both players; no disturbance without an opponent
 
-HALVINGS = 30  # of the way back to where the players have an answer: a billionth of an interval
-STREAM = 0x6272  # folded into the key, so that the draws share nothing with the Brownian path, which splits it
-NEWTON = 3  # steps onto the edge of the target, whose function need not be linear
-EDGE = 1e-6  # the least share of a step before or after a meeting: shares of 0 and 1 would be no zero inside it
+HALVINGS = 30  # of the path back to the last point at which the players are defined: a billionth of an interval
+STREAM = 0x6272  # folded into the key, so that the draws are independent of the Brownian path, which splits the key
+NEWTON = 3  # steps onto the boundary of the target, whose function need not be linear
+EDGE = 1e-6  # the smallest share of a step before or after a meeting; shares of 0 and 1 would give no zero inside it
 
 
 @pytree_dataclass(static=("clamp", "due"))
@@ -46,13 +45,13 @@ class Loop:
 
     Args:
       problem: the system and its costs.
-      control: a pytree that is called with (t, x); None where there is no control.
-      opponent: a pytree like it for the disturbance; None where nobody acts.
-      grid: the Grid in whose box the players are known; None where that is everywhere.
-      clamp: outside the box, True goes on with what the players say at its nearest point, False ends the path.
-      surplus: ψ − V as a function of (t, x), zero where the path is stopped; None where V stops no path.
-      due: what is paid after the last time: "terminal cost", "V at the horizon", or "nothing" of a path cut short.
-      at_horizon: V there as a function of (t, x), where it is not what the problem says.
+      control: a pytree that is called with (t, x); None if there is no control.
+      opponent: a callable pytree for the disturbance; None without an opponent.
+      grid: the Grid in whose box the players are known; None if they are known everywhere.
+      clamp: outside the box, True continues with the players at the nearest point of the box, False ends the path.
+      surplus: ψ − V as a function of (t, x), zero where the path is stopped; None if V stops no path.
+      due: the payment after the last time: "terminal cost", "V at the horizon", or "nothing" for a shortened path.
+      at_horizon: V at the horizon as a function of (t, x), if the problem does not define it.
     """
 
     problem: Problem
@@ -65,28 +64,28 @@ class Loop:
     at_horizon: Callable | None = None
 
     def wrap(self, x: State) -> State:
-        """The state with its periodic entries in the box."""
+        """The state with its periodic entries wrapped into the box."""
         return x if self.grid is None else self.grid.wrap(x)
 
     def players(self, t: Number, x: State) -> Actions:
-        """The control, shape (m,), and the disturbance, shape (l,), or None; NaN where they have no answer."""
+        """The control, shape (m,), and the disturbance, shape (l,), or None; NaN where they are undefined."""
         u = jnp.zeros(0, x.dtype) if self.control is None else self._ask(self.control, t, x)
         return u, None if self.opponent is None else self._ask(self.opponent, t, x)
 
     def actions(self, t: Number, x: State, since: Event) -> Actions:
-        """The players at (t, x); where they have no answer, as in the target, that of the last place which has one.
+        """The players at (t, x), or, if they are undefined there, at the last point where they are defined.
 
         Args:
           t: the time.
-          x: the state, which a stage of a step may put into the target.
-          since: a time and a state before, where the players have an answer.
+          x: the state, which a stage of a step may place inside the target.
+          since: an earlier time and state at which the players are defined.
         """
         now = self.players(t, x)
         if not self.guarded:
             return now
 
         def halve(_: int, way: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            known, lost = way  # shares of the way: the players answer at the first, and do not at the second
+            known, lost = way  # shares of the path: the players are defined at the first, and not at the second
             middle = (known + lost) / 2
             there = self._between(since, (t, x), middle)
             good = (self.target(*there) > 0) & are_finite(self.players(*there))
@@ -97,17 +96,17 @@ class Loop:
             known, _ = jax.lax.fori_loop(0, HALVINGS, halve, ends)
             return self.players(*self._between(since, (t, x), known))
 
-        # a branch and no `where`: but under vmap the halvings are paid only at the few stages beyond a boundary
+        # a branch rather than `where`: without vmap, halvings are only computed at the few stages beyond a boundary
         return jax.lax.cond((self.target(t, x) > 0) & are_finite(now), lambda: now, before)
 
     def _between(self, since: Event, now: Event, share: jax.Array) -> Event:
-        """The point at a share of the straight way from one event to another."""
+        """The point at a given share of the straight line between two events."""
         (t, x), (later, end) = since, now
         return t + share * (later - t), x + share * (end - x)
 
     @property
     def guarded(self) -> bool:
-        """True if there is a place where the players need not have an answer: inside a target, or on a grid."""
+        """True if the players may be undefined somewhere: inside a target, or outside a grid."""
         return (self.control is not None or self.opponent is not None) and (self.ends or self.grid is not None)
 
     @property
@@ -116,9 +115,9 @@ class Loop:
         return self.problem.target is not None or self.surplus is not None
 
     def _ask(self, player: Callable, t: Number, x: State) -> jax.Array:
-        """A player's action at (t, x); the player sees the state in the box."""
+        """A player's action at (t, x); the player receives the state in the box."""
         if self.grid is not None:
-            # a stage of a step may lie beyond the edge at which the path is about to end
+            # a stage of a step may be beyond the boundary at which the path is about to end
             x, (lo, hi) = self.grid.wrap(x), self._corners(x)
             x = jnp.where(np.array(self.grid.periodic), x, jnp.clip(x, lo, hi))
         return jnp.asarray(player(t, x), x.dtype)
@@ -142,33 +141,33 @@ class Loop:
     def noise(self, t: Number, x: State, u: Control, d: Disturbance | None) -> jax.Array:
         """σ with a zero row for the cost, shape (n+1, k)."""
         sigma = self.problem.diffusion(self.wrap(x), u, d, t).astype(x.dtype)
-        # the cost is the last state of the integrator; it feels the noise through the path alone
+        # the cost is the last state of the integrator; noise affects it only through the path
         return jnp.pad(sigma, ((0, 1), (0, 0)))
 
     def target(self, t: Number, x: State) -> jax.Array:
-        """A function ≤ 0 in the target and where V stops the path; inf where there is neither."""
+        """A function ≤ 0 in the target and where V stops the path; inf if there is neither."""
         level = self.number(jnp.inf if self.problem.target is None else self.problem.target, t, x)
         return level if self.surplus is None else jnp.minimum(level, self.surplus(t, self.wrap(x)))
 
     def margin(self, x: State) -> jax.Array:
-        """The distance to the edge of the box over its width, ≤ 0 outside; inf where the path may go anywhere."""
+        """The distance to the boundary of the box over its width, ≤ 0 outside; inf if the path is not limited."""
         if self.grid is None or self.clamp:
             return jnp.asarray(jnp.inf, x.dtype)
         lo, hi = self._corners(x)
-        inside = jnp.minimum(x - lo, hi - x) / (hi - lo)  # over the width, so that axes of any units compare
-        # A path may rest on the edge, where rounding must not push it out: 64 units in the last place, 1.4e-14 of the
-        # width in float64, is far above the rounding of a step and far below what anybody would call outside.
+        inside = jnp.minimum(x - lo, hi - x) / (hi - lo)  # relative to the width, so that units do not matter
+        # rounding must not push a path that rests on the boundary outside: 64 units in the last place, 1.4e-14 of the
+        # width in float64, exceed the rounding of a step by far and are still negligible
         slack = 64 * jnp.finfo(x.dtype).eps
         return jnp.min(jnp.where(np.array(self.grid.periodic), jnp.inf, inside)) + slack
 
     def number(self, value: Number | Callable | None, t: Number, x: State) -> jax.Array:
-        """The number that a number (None is zero) or a function of the state stands for at (t, x)."""
+        """The number at (t, x) given by a number, a function of the state, or None for zero."""
         if callable(value):
             value = value(*self.problem.state_arguments(self.wrap(x), t))
         return jnp.asarray(0.0 if value is None else value, x.dtype)
 
     def paid_at_end(self, t: Number, x: State) -> jax.Array:
-        """The cost of ending at (t, x), where ``target`` is ≤ 0: on the target the exit cost, elsewhere ψ."""
+        """The cost of ending at (t, x), where ``target`` is ≤ 0: the exit cost on the target, ψ elsewhere."""
         exit_cost = self.number(self.problem.exit_cost, t, x)
         if self.surplus is None:
             return exit_cost
@@ -194,16 +193,16 @@ class Loop:
 
 
 def are_finite(actions: Actions) -> jax.Array:
-    """True if every entry of both players' actions is finite: a feedback says NaN where it has no answer."""
+    """True if every entry of both players' actions is finite; a feedback is NaN where it is undefined."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(each)) for each in jax.tree.leaves(actions)]))
 
 
 def check_shapes(loop: Loop, x0: Array) -> None:
-    """Trace every function of the loop once, abstractly, and compare the shapes it returns with those wanted."""
+    """Trace every function of the loop once, abstractly, and compare the shapes with the required shapes."""
     problem, n = loop.problem, x0.shape[0]
     m = 0 if problem.controls is None else problem.controls.dim
     opponents = 0 if problem.disturbances is None else problem.disturbances.dim
-    # zeros, and a number of the state's type for the time: nothing is computed, only shapes and types are asked for
+    # zeros, and a number of the state's type for the time: only shapes and types are evaluated
     u, d = np.zeros(m, x0.dtype), np.zeros(opponents, x0.dtype)
     fed = {"x": x0, "u": u, "d": d, "t": x0[0]}
     action, place = problem.arguments("x", "u", "d", "t"), problem.state_arguments("x", "t")
@@ -219,7 +218,7 @@ def check_shapes(loop: Loop, x0: Array) -> None:
         ask = functools.partial(_array, function, name, letters)
         try:
             found = jax.eval_shape(ask, *(fed[letter] for letter in letters))
-        except ValueError as error:  # anew, or JAX adds some lines on frames of its own
+        except ValueError as error:  # raise a new error, otherwise JAX adds lines about its own frames
             raise ValueError(str(error)) from error.__cause__
         if jnp.issubdtype(found.dtype, jnp.complexfloating):
             raise ValueError(f"simulate: {name} returned complex numbers, expected real ones, shape {wanted}")
@@ -230,12 +229,12 @@ def check_shapes(loop: Loop, x0: Array) -> None:
 
 
 def _array(function: Callable, name: str, letters: Sequence[str], *arguments: Array) -> jax.Array:
-    """The function's result as an array; refuses what is none, and what fails or cannot be traced."""
+    """The function's result as an array; refuses other results, and functions that fail or cannot be traced."""
     try:
         result = function(*arguments)
     except Exception as error:
         said = checks.refusal(error, name, dict(zip(letters, map(np.shape, arguments), strict=True)))
-        if said is None:  # an exception of the user's own
+        if said is None:  # an exception from the user's code
             raise
         raise ValueError(f"simulate: {said}") from error
     try:
@@ -246,7 +245,7 @@ def _array(function: Callable, name: str, letters: Sequence[str], *arguments: Ar
 
 
 def random_key(problem: Problem, given: Key | int | None) -> Key | None:
-    """The random key, or that of a seed; refuses what is none, one without noise, and noise without one."""
+    """The random key, from a key or a seed; refuses a key without noise, and noise without a key."""
     if problem.noise is not None and given is None:
         raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
     if problem.noise is None and given is not None:
@@ -259,19 +258,19 @@ def random_key(problem: Problem, given: Key | int | None) -> Key | None:
 
 @pytree_dataclass()
 class BridgeDraw:
-    """The draws of one path: a uniform number, another, and a normal one for the step that begins at a time.
+    """The draws of one path: two uniform numbers and a normal number for the step that begins at a given time.
 
     Args:
-      key: of the path.
+      key: the random key of the path.
     """
 
     key: Key | None
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
-        """Three numbers; steps begin at different times, whose bits make a key of each."""
-        assert self.key is not None  # where there is noise there is a key
+        """Three numbers; the bits of the time at which a step begins make the key of the step."""
+        assert self.key is not None  # a noisy problem has a key
         key = jax.random.fold_in(self.key, STREAM)
-        for word in jnp.atleast_1d(jax.lax.bitcast_convert_type(t, np.uint32)):  # one of float32, two of float64
+        for word in jnp.atleast_1d(jax.lax.bitcast_convert_type(t, np.uint32)):  # one for float32, two for float64
             key = jax.random.fold_in(key, word)
         both, normal = jax.random.split(key)
         meets, early = jax.random.uniform(both, (2,), t.dtype)
@@ -279,26 +278,26 @@ class BridgeDraw:
 
 
 def slope_along(level: Callable, x: State, sigma: Array) -> tuple[Array, Array]:
-    """l and σ'∇l, shape (k,), at a state; a slope that is not finite, as of a norm at 0, counts as none."""
-    value, push = jax.linearize(level, x)  # forward: a target's function may hold a loop
+    """l and σ'∇l, shape (k,), at a state; a slope that is not finite, such as a norm's at 0, counts as zero."""
+    value, push = jax.linearize(level, x)  # forward mode, because a target's function may contain a loop
     slope = jax.vmap(push)(sigma.T)
     return value, jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
 def meeting(draws: tuple[Array, Array, Array], before: Array, after: Array, length: Number) -> tuple[Array, Array]:
-    """True if a bridge meets zero, and the share of the step after which it first does.
+    """True if a bridge meets zero, and the share of the step at which it first does.
 
     Args:
-      draws: of ``BridgeDraw.at``.
+      draws: the numbers of ``BridgeDraw.at``.
       before: d₀ > 0, the distance at the start in units of the noise, length^½.
-      after: d₁, at the end.
-      length: h, of the step.
+      after: d₁, the distance at the end.
+      length: h, the length of the step.
     """
     meets, early, normal = draws
-    # −2 d₀d₁/h ≥ 0 where the end is inside: met for sure
+    # −2 d₀d₁/h ≥ 0 if the end is inside the target, so it is met for sure
     met = meets < jnp.exp(-2 * before * after / length)
     # the inverse Gaussian of Michael, Schucany and Haas: the root of a quadratic in the square of a normal number,
-    # written so that nothing cancels for large means; with probability mean/(mean + root) it, else mean²/root
+    # written without cancellation for large means; take it with probability mean/(mean + root), otherwise mean²/root
     mean = before / jnp.maximum(jnp.abs(after), jnp.finfo(before.dtype).eps * before)
     spread = 0.5 * mean * length * normal * normal / (before * before)
     root = mean / (1 + spread + jnp.sqrt(spread * (spread + 2)))
@@ -307,19 +306,19 @@ def meeting(draws: tuple[Array, Array, Array], before: Array, after: Array, leng
 
 
 def onto_edge(level: Callable, x: State, sigma: Array) -> State:
-    """The state moved along σσ'∇l, as the noise moves it, until it lies on the edge of the target."""
+    """The state moved along σσ'∇l, the direction of the noise, onto the boundary of the target."""
     for _ in range(NEWTON):
         value, slope = slope_along(level, x, sigma)
         square = slope @ slope
-        # where noise does not act across the edge, the state stays
+        # the state stays if the noise does not act across the boundary
         x = x - jnp.where(square > 0, value / jnp.where(square > 0, square, 1.0), 0.0) * (sigma @ slope)
     return x
 
 
 def meeting_flag(loop: Loop, draw: BridgeDraw, sigma: Array, begins: Event, ends: Event) -> jax.Array:
-    """The flag at the end of a step that has it 1 at its start: less than 1 where the target is met.
+    """The flag at the end of a step, less than 1 if the step meets the target; the flag at its start is 1.
 
-    On the straight line between the two 0 lies where that is: 1 − 1/share at the end.
+    The flag at the end is 1 − 1/share, so that the straight line between the two values is 0 at the meeting.
     """
     (t, x), (later, end) = begins, ends
     (before, first), (after, last) = (
@@ -329,7 +328,7 @@ def meeting_flag(loop: Loop, draw: BridgeDraw, sigma: Array, begins: Event, ends
     acts = jnp.all(sizes > 0)
     sizes = jnp.where(acts, sizes, 1.0)
     met, share = meeting(draw.at(jnp.asarray(t, x.dtype)), before / sizes[0], after / sizes[1], later - t)
-    # a box that is left on the way to a target behind its edge was left first
+    # if the path leaves the box before it meets a target outside, it left the box first
     way = jnp.where(after <= 0, before / jnp.where(after <= 0, before - after, 1.0), 0.0)
     met &= acts & (loop.margin(x + way * (end - x)) > 0)
     return jnp.where(met, 1 - 1 / share, 1.0).astype(x.dtype)
@@ -337,29 +336,29 @@ def meeting_flag(loop: Loop, draw: BridgeDraw, sigma: Array, begins: Event, ends
 
 @functools.cache
 def bridging(kind: type) -> type:
-    """A solver of diffrax that writes the flag of each step into the last entry of the state at its end."""
+    """A diffrax solver that writes the flag of each step into the last entry of the state at its end."""
 
     class Bridging(kind):
-        flag: Any = None  # no field without a default may come behind those of the base
+        flag: Any = None  # a field after the base class's fields needs a default
 
         def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
             y1, error, dense, state, result = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
             y1 = y1.at[-1].set(self.flag(t0, t1, y0, y1, args))
-            # the event is located on the straight line between the ends, which these two solvers interpolate by
+            # the event is located on the straight line between the ends, the interpolant of both of these solvers
             return y1, error, {**dense, "y1": y1}, state, result
 
     return Bridging
 
 
 def timeless(function: Callable, t: Number, x: State) -> Array:
-    """A user's function of the state alone, as one of time and state."""
+    """A user's function of the state, called with time and state."""
     return function(x)
 
 
 def settled_loop(loop: Loop, n: int, own: Mapping[str, object]) -> Loop:
-    """The loop with the problem's functions, and the user's ``own`` players, looked at now.
+    """The loop with the problem's functions, and the user's ``own`` players, in their current state.
 
-    A changed object is seen, and a function that computes as before compiles nothing again.
+    Changes of an object are noticed, and a function that computes the same as before is not compiled again.
     """
     players = {name: getattr(loop, name) for name, given in own.items() if given is not None}
     for name, player in players.items():

@@ -1,4 +1,4 @@
-"""Output feedback: the plant is steered by what an observer makes of the measurements."""
+"""Output feedback: a plant controlled through an observer of its measurements."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -30,7 +30,7 @@ from hjbjax.solution.status import warn
 from hjbjax.tracing import checks, closures
 
 ROUNDING = 1e-9  # relative: a duration of 0.3 is three steps of 0.1
-MOST = 10**7  # intervals of a path: 80 MB a state
+MOST = 10**7  # intervals of a path: 80 MB per state
 
 
 @front_door
@@ -49,37 +49,37 @@ def simulate_output(
     substeps: int = 4,
     grid: Grid | None = None,
 ) -> OutputPath:
-    """Paths of the plant under a control that sees the observer's information state alone.
+    """Paths of the plant under a control that depends only on the observer's information state.
 
         dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv,    u = control(information state)
 
-    The control is held over dt; then the observer is told u, the increment dy and dt, and nothing else. The plant
-    moves in sub-steps of weak order 1, of order 2 without noise. A path ends in the target, which ``observer`` and
-    ``control`` need not know of. Periodic states are wrapped into the grid, where one is known, before any function
-    sees them, so that h should be periodic as well. In float64; under a tracer (``jit``, ``vmap``) in the type of x0,
-    without checks, with forward derivatives (``jacfwd``).
+    The control is held over dt; then the observer receives u, the increment dy and dt, and nothing else. The plant
+    makes sub-steps of weak order 1, or order 2 without noise. A path ends in the target of the problem, even if
+    ``observer`` and ``control`` do not use the target. If a grid is known, periodic states are wrapped into it before
+    they are passed to any function, so h should be periodic too. Computes in float64. Under a tracer (``jit``,
+    ``vmap``) it computes in the type of x0, without checks, and has forward derivatives (``jacfwd``).
 
     Args:
-      problem: the plant and its costs; no game.
-      observer: an ``Observer``, as ``ExtendedKalman``, ``Luenberger`` or ``GridFilter``.
+      problem: the plant and its costs; not a game.
+      observer: an ``Observer``, for example ``ExtendedKalman``, ``Luenberger`` or ``GridFilter``.
       control: a function of the observer's state that returns the control, shape (m,), or a Solution or
-        ``greedy_feedback``, which is asked at the observer's estimate: certainty equivalence. Where a Solution has no
-        control, as in its target, the one before is held. ``None`` without controls. One with a method
-        ``judge(path)`` is shown what came out, as that of ``minimum_stress``, which warns by it.
+        ``greedy_feedback``, which is evaluated at the observer's estimate (certainty equivalence). Where a Solution has
+        no control, as in its target, the previous control is kept. ``None`` without controls. If the control has a
+        method ``judge(path)``, it is called with the result and may warn, as ``minimum_stress`` does.
 
     Keyword Args:
-      h: the measured function of one state, returns shape (p,): the plant's, which need not be the observer's.
-      x0: the state of the plant at t = 0, shape (n,), or (batch, n), one a path.
-      duration: in units of time.
+      h: the measured function of one state, returns shape (p,). It belongs to the plant; the observer's may differ.
+      x0: the state of the plant at t = 0, shape (n,), or (batch, n) with one state per path.
+      duration: the length of the paths, in units of time.
       dt: the time between two updates; the last interval may be shorter.
-      key: a JAX random key or an integer, or an array of keys, shape (batch,), one a path.
+      key: a JAX random key or an integer, or an array of keys, shape (batch,), one per path.
       measurement_noise: r: a number, (p,) or (p, p); 0 for a measurement without noise.
-      paths: how many to make from one key; ``None`` for one, without an axis for a batch.
+      paths: the number of paths to make from one key; ``None`` for one path without a batch axis.
       substeps: steps of the plant between two updates.
-      grid: whose periodic axes are wrapped; ``None``: that of a Solution, or of the observer, if it has one.
+      grid: the grid whose periodic axes are wrapped. Default: the grid of the Solution or of the observer, if any.
 
     Returns:
-      An ``OutputPath``. Paths that end early, except in the target, are warned of and have it in their ``code``.
+      An ``OutputPath``. Paths that end early, except in the target, cause a warning and have a ``code`` that says why.
 
     Raises:
       ValueError: an argument that is not admissible, or a function that returns the wrong shape.
@@ -131,11 +131,11 @@ _jit_paths = jax.jit(_paths, static_argnums=4)
 
 
 def _sees_tracers(loop: OutputLoop) -> bool:
-    """True if the control closes over numbers that somebody traces, as of a gain whose derivative is wanted."""
+    """True if the control closes over traced numbers, for example a gain that is being differentiated."""
     m = 0 if loop.plant.problem.controls is None else loop.plant.problem.controls.dim
     try:
         closed = jax.make_jaxpr(lambda u: loop.control(jnp.zeros(()), loop.initial(), u))(jnp.zeros(m))
-    except (TypeError, ValueError):  # whose reason the checks will tell
+    except (TypeError, ValueError):  # the checks report the reason later
         return False
     return is_traced(closed.consts)
 
@@ -154,7 +154,7 @@ def _initial_states(x0: object) -> Any:
     """x0 as an array (n,) or (batch, n)."""
     state = jnp.asarray(x0) if is_traced(x0) else numbers(x0, "simulate_output: x0")
     if np.ndim(state) not in (1, 2) or 0 in np.shape(state):
-        raise ValueError(f"simulate_output: x0 has shape {np.shape(state)}, wanted (n,), or (batch, n), one a path")
+        raise ValueError(f"simulate_output: x0 has shape {np.shape(state)}, wanted (n,), or (batch, n), one per path")
     if not is_traced(state) and not np.all(np.isfinite(state)):
         raise ValueError(f"simulate_output: x0 is {arguments.shown(x0)}, wanted finite numbers")
     return state
@@ -166,7 +166,7 @@ def _count(keys: Key) -> int:
 
 
 def _keys(given: Any, paths: int | None, batch: tuple[int, ...]) -> Key:
-    """One key, or one a path."""
+    """One key, or one key per path."""
     key = arguments.random_key(given, "simulate_output: key", batch=True)
     count = _count(key)
     if paths is not None:
@@ -174,18 +174,18 @@ def _keys(given: Any, paths: int | None, batch: tuple[int, ...]) -> Key:
             raise ValueError(f"simulate_output: got {count} keys and paths = {paths}; leave out one of them")
         count = arguments.count(paths, "simulate_output: paths")
     if batch and count not in (0, batch[0]):
-        raise ValueError(f"simulate_output: got {batch[0]} states and {count} paths, wanted as many of both")
-    wanted = count or (batch[0] if batch else 0)  # each start gets a key of its own
+        raise ValueError(f"simulate_output: got {batch[0]} states and {count} paths, wanted the same number of both")
+    wanted = count or (batch[0] if batch else 0)  # each initial state gets its own key
     return key if _count(key) or not wanted else jax.random.split(key, wanted)
 
 
 def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
-    """The problem with its functions as they are now; refuses what is no plant of n states, and no observer."""
+    """The problem with its functions as they are now, after checks that it is a plant of n states with an observer."""
     if not isinstance(problem, Problem):
         raise TypeError(f"simulate_output: got {type(problem).__name__}, wanted a Problem")
     if problem.is_game or problem.running_max is not None:
         what = "disturbances" if problem.is_game else "a running_max"
-        fix = "put noise in their place" if problem.is_game else "leave it out, and take the maximum along path.states"
+        fix = "use noise instead" if problem.is_game else "leave it out, and take the maximum along path.states"
         raise ValueError(f"simulate_output: got a problem with {what}, wanted one player and a running cost; {fix}")
     missing = [name for name in ("initial", "update", "estimate") if not callable(getattr(observer, name, None))]
     if missing:
@@ -199,7 +199,7 @@ def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
 
 
 def _box(grid: Grid | None, control: Any, observer: Observer, n: int) -> Grid | None:
-    """The grid that says which states are periodic: the one that was given, the feedback's, or the observer's."""
+    """The grid that defines the periodic states: the argument, or the grid of the feedback or the observer."""
     if grid is None and is_grid_feedback(control):
         grid = control.grid
     grid = getattr(observer, "grid", None) if grid is None else grid
@@ -212,7 +212,7 @@ def _closed(
     problem: Problem, observer: Observer, control: Any, measured: Measurement, grid: Grid | None, duration: float
 ) -> OutputLoop:
     """The loop through an observer and a function, or a feedback at its estimate."""
-    # bound methods of a pytree bring its numbers along as leaves; those of another object belong to the program
+    # the numbers of a pytree become leaves of its bound methods; the numbers of another object are compiled in
     initial, update, estimate = (_method(observer, name) for name in ("initial", "update", "estimate"))
     acts: Any
     if problem.controls is None:
@@ -228,7 +228,7 @@ def _closed(
     else:
         raise TypeError(
             f"simulate_output: control is {arguments.shown(control)}, wanted a function of the observer's state, or a "
-            "Solution, which is asked at its estimate"
+            "Solution, which is evaluated at its estimate"
         )
     return OutputLoop(Loop(problem, None, None, grid, clamp=True), measured, initial, update, estimate, acts)
 
@@ -247,12 +247,12 @@ def _within_horizon(problem: Problem, solution: GridFeedback, duration: float) -
 
 
 def _check_shapes(loop: OutputLoop, x0: np.ndarray) -> None:
-    """Trace observer and control once, abstractly, and compare what they return with what is wanted."""
+    """Trace observer and control once, abstractly, and compare the shapes they return with the required shapes."""
     m = 0 if loop.plant.problem.controls is None else loop.plant.problem.controls.dim
     u, dy, dt = np.zeros(m), np.zeros(loop.measurement.dim), np.zeros(())
     information = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, loop.initial()))
     try:
-        # as arguments, and not closed over: an observer would judge their values
+        # passed as arguments rather than closed over, because an observer would check concrete values
         told = jax.eval_shape(lambda *seen: jax.tree.map(jnp.asarray, loop.update(loop.initial(), *seen)), u, dy, dt)
     except (TypeError, ValueError) as error:
         said = (str(error).strip() or type(error).__name__).splitlines()[0]
@@ -264,8 +264,8 @@ def _check_shapes(loop: OutputLoop, x0: np.ndarray) -> None:
     before, after = ([leaf.shape for leaf in jax.tree.leaves(each)] for each in (information, told))
     if forms[0] != forms[1] or before != after:
         raise ValueError(
-            f"simulate_output: update(state, u, dy, dt) returned a pytree of arrays of shapes {after}, wanted that of "
-            f"initial(), {before}: {arguments.shown(forms[0])}"
+            f"simulate_output: update(state, u, dy, dt) returned a pytree of arrays of shapes {after}, wanted the one "
+            f"that initial() returns, {before}: {arguments.shown(forms[0])}"
         )
     for name, found, wanted in (
         ("the observer's estimate", jax.eval_shape(lambda: jnp.asarray(loop.estimate(loop.initial()))), x0.shape),
@@ -276,7 +276,7 @@ def _check_shapes(loop: OutputLoop, x0: np.ndarray) -> None:
 
 
 def _report(path: OutputPath) -> None:
-    """Warn of paths that end early, except in the target."""
+    """Warn about paths that end early, except in the target."""
     codes = np.atleast_1d(path.code)
     for code in np.unique(codes):
         status = PathStatus(int(code))
@@ -288,6 +288,6 @@ def _report(path: OutputPath) -> None:
 
 
 ADVICE = {
-    PathStatus.NONFINITE: "stopped before a step to no finite state or estimate; a shorter dt or more substeps may do",
+    PathStatus.NONFINITE: "stopped before a state or estimate that is not finite; try a shorter dt or more substeps",
     PathStatus.UNDEFINED: "stopped where the control is not finite",
 }

@@ -2,12 +2,12 @@
 
     dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv,    u = control(information state), held from one update to the next
 
-The plant moves in sub-steps τ by the predictor and corrector of E. Platen with noise as Itô has it,
+Between updates the plant makes sub-steps τ with Platen's predictor–corrector scheme in the Itô sense,
 
     x̃ = x + f(x) τ + σ(x) Δw,    x ← x + ½ (f(x) + f(x̃)) τ + σ(x) Δw,
 
-of weak order 1 and of order 2 where there is no noise; dy and the running cost are integrated by the trapezoidal rule
-at the same points. With noise a target is also met between two points, by a draw of its own, see ``loop``.
+which has weak order 1, and order 2 without noise. The trapezoidal rule at the same points integrates dy and the running
+cost. With noise a target can also be met within a sub-step, see ``loop``.
 """
 
 import functools
@@ -31,7 +31,7 @@ class Observer(Protocol):
 
     Example:
       >>> @pytree_dataclass()
-      ... class LowPass:  # takes the measurement for the state, smoothed over a time
+      ... class LowPass:  # uses the measurement as the state, smoothed over a time
       ...     time: float
       ...     def initial(self):
       ...         return jnp.zeros(1)
@@ -47,7 +47,7 @@ class Observer(Protocol):
         """The information state at t = 0, any pytree of arrays."""
 
     def update(self, state: Any, u: Control, dy: Array, dt: Number) -> Any:
-        """The information state after holding the control u (m,) for dt and seeing the increment dy (p,).
+        """The information state after applying the control u (m,) for dt and measuring the increment dy (p,).
 
         The observers of ``hjbjax.filtering`` take ``dy=None`` for a prediction, a step without a measurement.
         """
@@ -58,20 +58,20 @@ class Observer(Protocol):
 
 @pytree_dataclass()
 class OutputPath:
-    """The history of a loop closed through an observer; a batch of paths has its axis in front of all.
+    """The history of a loop closed through an observer; a batch of paths adds a leading axis to every array.
 
-    Arrays have full length: after the end of a path its times, states and estimates repeat the last ones, controls and
-    measurements are NaN.
+    Arrays have full length: after the end of a path, times, states and estimates repeat the last entry, and controls
+    and measurements are NaN.
 
     Args:
       times: shape (k+1,), from 0.
-      states: of the plant, shape (k+1, n), periodic ones unwound.
-      controls: held over each interval, shape (k, m).
-      measurements: the increments dy over each interval, shape (k, p).
-      estimates: of the state, by the observer, shape (k+1, n); the first one is made before anything is measured.
-      information: the observer's last state.
+      states: the states of the plant, shape (k+1, n), with periodic states unwound.
+      controls: the control over each interval, shape (k, m).
+      measurements: the increment dy over each interval, shape (k, p).
+      estimates: the observer's estimates, shape (k+1, n); the first one precedes all measurements.
+      information: the last information state of the observer.
       cost: ∫ e^{−βt} L dt, plus the discounted exit cost if the target was reached, else the discounted terminal cost.
-      reached: the time at which the target was reached, inf if it was not.
+      reached: the time at which the target was reached; inf if it was not.
       code: a PathStatus number.
     """
 
@@ -87,7 +87,7 @@ class OutputPath:
 
     @property
     def status(self) -> PathStatus:
-        """Why the path ends, of a single path."""
+        """The reason for the end of a single path."""
         return PathStatus(int(self.code))
 
 
@@ -97,11 +97,11 @@ class OutputLoop:
 
     Args:
       plant: the plant and its costs, as a loop without players.
-      measurement: what is measured.
-      initial: the observer's three functions, each a pytree that can be called.
-      update: likewise.
-      estimate: likewise.
-      control: a pytree that is called with the time, the information state and the control before.
+      measurement: the sensor.
+      initial: the observer's function ``initial``, a callable pytree like the next two.
+      update: the observer's function ``update``.
+      estimate: the observer's function ``estimate``.
+      control: a pytree that is called with the time, the information state and the previous control.
     """
 
     plant: Loop
@@ -114,10 +114,10 @@ class OutputLoop:
 
 @pytree_dataclass()
 class CertaintyEquivalence:
-    """The control of a feedback at the estimate; where it has none, the one before.
+    """The control of a feedback at the estimate; the previous control where the feedback has none.
 
     Args:
-      estimate: the observer's.
+      estimate: the observer's function.
       feedback: a pytree that is called with (t, x), as ``feedback.lookups`` returns it.
       grid: the box in which the feedback is known.
     """
@@ -130,22 +130,22 @@ class CertaintyEquivalence:
         """The control, shape (m,)."""
         x = jnp.asarray(self.estimate(information))
         u = jnp.asarray(self.feedback(t, self.grid.wrap(x)), before.dtype)
-        # an estimate may lie in the target, where a solution has no control, while the state does not
+        # an estimate may be in the target, where a solution has no control, although the state is outside
         return jnp.where(jnp.isnan(u), before, u)
 
 
 def of_information(function: Callable, t: Number, information: Any, before: Control) -> Control:
-    """A user's function of the information state alone."""
+    """A user's function of the information state, with the arguments of a controller."""
     return jnp.asarray(function(information), before.dtype)
 
 
 def no_control(t: Number, information: Any, before: Control) -> Control:
-    """No control."""
+    """A controller for a plant without controls."""
     return before
 
 
 def output_path(loop: OutputLoop, x0: State, times: Array, key: Key, *, substeps: int) -> OutputPath:
-    """The path from x0 over the output times, shape (k+1,), each interval in ``substeps`` steps of the plant."""
+    """The path from x0 over the output times, shape (k+1,), with ``substeps`` steps of the plant per interval."""
     plant, dtype, count = loop.plant, x0.dtype, len(times) - 1
     brownian, bridge = jax.random.split(key)
     m = 0 if plant.problem.controls is None else plant.problem.controls.dim
@@ -165,7 +165,7 @@ def output_path(loop: OutputLoop, x0: State, times: Array, key: Key, *, substeps
             loop.update(information, u, dy, later - t),
             information,
         )
-        # of an estimate that is not finite no control can be made, nor a picture
+        # an estimate that is not finite gives no control
         sound = jnp.all(jnp.isfinite(moved)) & jnp.all(jnp.isfinite(loop.estimate(told)))
         code = jnp.where(active & ~sound, PathStatus.NONFINITE, jnp.where(active & met, PathStatus.TARGET, code))
         runs = active & sound
@@ -178,7 +178,7 @@ def output_path(loop: OutputLoop, x0: State, times: Array, key: Key, *, substeps
 
     information = jax.tree.map(jnp.asarray, loop.initial())
     begins = jnp.where(plant.target(times[0], x0) <= 0, PathStatus.TARGET, PathStatus.DURATION).astype(jnp.int32)
-    nobody = jnp.full(m, jnp.nan, dtype)  # where the first control is asked for, there is none before
+    nobody = jnp.full(m, jnp.nan, dtype)  # there is no control before the first one
     first = (times[0], jnp.append(x0, 0.0), information, nobody, begins)
     last, (later, states, controls, records, estimates) = jax.lax.scan(interval, first, (jnp.arange(count), times[1:]))
     t, z, final, _, code = last
@@ -207,9 +207,9 @@ def _sources(plant: Loop, x0: State, m: int) -> int:
 def _advanced(
     loop: OutputLoop, draw: BridgeDraw, begins: tuple[Array, Array], u: Control, end: Array, shake: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Time, state with cost, the increment dy and True if the target was met, at the end of an interval or there.
+    """Time, state with cost, increment dy, and True if the target was met, at the end of an interval or at the target.
 
-    ``shake`` is a draw of unit normal numbers, a row a sub-step: what drives the plant, then what spoils y.
+    ``shake`` holds unit normal numbers, one row per sub-step: first for the noise of the plant, then for that in y.
     """
     plant, measured, (t, z), p = loop.plant, loop.measurement, begins, loop.measurement.dim
     dtype, tau, sources = z.dtype, (end - t) / len(shake), shake.shape[1] - p
@@ -228,7 +228,7 @@ def _advanced(
         guessed, seen_then = rate(t + tau, z + tau * slope + push)
         moved = z + tau / 2 * (slope + guessed) + push
         hit, share = _meeting(plant, draw, sigma[:-1], (t, z[:-1]), (t + tau, moved[:-1]))
-        # up to a target that is met on the way; a record ends there, and so does its noise
+        # shorten the sub-step if the target is met in it: the record and its noise end there
         later = t + share * tau
         further = dy + share * tau / 2 * (seen + seen_then) + jnp.sqrt(share) * error
         new = (later, _on_target(plant, sigma, later, z + share * (moved - z), hit), further, hit)
@@ -240,22 +240,22 @@ def _advanced(
 
 
 def _meeting(plant: Loop, draw: BridgeDraw, sigma: Array, begins: tuple, ends: tuple) -> tuple[Array, Array]:
-    """True if a sub-step meets the target, and the share of it after which it does; 1 where it does not."""
+    """True if a sub-step meets the target, and the share of the sub-step at which it does; otherwise 1."""
     if plant.problem.target is None:
         return jnp.zeros((), bool), jnp.ones((), ends[1].dtype)
     before, after = plant.target(*begins), plant.target(*ends)
     hit = after <= 0
-    # where the target's function is zero on the straight line, if it is linear
+    # the zero of the target function on the straight line, if the function is linear
     share = jnp.where(hit, before / jnp.where(hit, before - after, 1), 1).astype(ends[1].dtype)
     if plant.problem.noise is not None:
-        flag = meeting_flag(plant, draw, sigma, begins, ends)  # 1 − 1/share where the bridge meets it
+        flag = meeting_flag(plant, draw, sigma, begins, ends)  # 1 − 1/share if the bridge meets the target
         bridged = flag < 1
         hit, share = hit | bridged, jnp.where(bridged, 1 / jnp.where(bridged, 1 - flag, 1), share)
     return hit, share
 
 
 def _on_target(plant: Loop, sigma: Array, t: Array, z: Array, hit: Array) -> Array:
-    """The state with cost, moved by the noise onto the edge of a target that is met; a bridge is no straight line."""
+    """The state with cost, moved along the noise onto the boundary of the target if the sub-step meets it."""
     if plant.problem.target is None or plant.problem.noise is None:
         return z
     edge = onto_edge(functools.partial(plant.target, t), z[:-1], sigma[:-1])

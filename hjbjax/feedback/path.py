@@ -1,4 +1,4 @@
-"""The result of a simulation: a path, why it ends, and the line that says so."""
+"""The result of a simulation: a path, the reason for its end, and a one-line message."""
 
 import enum
 from typing import Any
@@ -12,11 +12,11 @@ from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array
 from hjbjax.solution.status import warn
 
-MANY = 1000  # internal steps, beside an eighth of those allowed: more of them tell of a feedback that jumps
+MANY = 1000  # internal steps: with more, and more than an eighth of max_steps, the feedback probably jumps
 
 
-class PathStatus(enum.IntEnum):  # of integers, since compiled programs and vmap know no others
-    """Why a path ends."""
+class PathStatus(enum.IntEnum):  # integers, because compiled programs and vmap support no other type
+    """The reason why a path ends."""
 
     DURATION = 0
     TARGET = 1
@@ -28,17 +28,17 @@ class PathStatus(enum.IntEnum):  # of integers, since compiled programs and vmap
 
     @property
     def message(self) -> str:
-        """The end and advice in words that follow 'the path'."""
+        """The end of the path, and advice, in words that follow 'the path'."""
         return MESSAGES[self]
 
 
 MESSAGES = {
     PathStatus.DURATION: "ran for the whole duration",
     PathStatus.TARGET: "reached the target",
-    PathStatus.LEFT_BOX: "stopped where it left the box of the grid; enlarge the grid, or go on with clamp=True",
-    PathStatus.MAX_STEPS: "stopped after max_steps internal steps; give hold=dt, or more max_steps",
-    PathStatus.NONFINITE: "stopped before a step to no finite state; drift, cost or feedback are not finite ahead",
-    PathStatus.UNDEFINED: "stopped where the feedback has no control (NaN): the target may be out of reach from there",
+    PathStatus.LEFT_BOX: "stopped where it left the box of the grid; enlarge the grid, or continue with clamp=True",
+    PathStatus.MAX_STEPS: "stopped after max_steps internal steps; use hold=dt, or a larger max_steps",
+    PathStatus.NONFINITE: "stopped before a step to a state that is not finite; drift, cost or feedback are not finite",
+    PathStatus.UNDEFINED: "stopped where the feedback has no control (NaN); the target may be unreachable from there",
     PathStatus.INTERRUPTED: "was interrupted",
 }
 
@@ -53,26 +53,26 @@ class Interrupted(KeyboardInterrupt):
 
 @pytree_dataclass(static=("held",), host=("message",))
 class Path:
-    """A closed loop's history, truncated where it ends.
+    """The history of a closed loop, truncated at its end.
 
     Args:
-      times: shape (k+1,), from 0; the last is where the path ends.
+      times: shape (k+1,), from 0 to the end of the path.
       states: shape (k+1, n), periodic states unwound (``grid.wrap`` brings them into the grid).
-      controls: shape (k, m), the control at the start of each interval; under ``hold`` all through it.
-      disturbances: shape (k, l), likewise, or None where there is no opponent.
-      cost: discounted running cost, plus what is due at the end: the discounted exit cost on the target, ψ where V = ψ,
-        and what ``march`` assumed at the horizon. Of a tube the cost of the best moment to stop: the least ψ on the
+      controls: shape (k, m), the control at the start of each interval; with ``hold``, throughout the interval.
+      disturbances: shape (k, l), like controls, or None if there is no opponent.
+      cost: discounted running cost plus the payment at the end: the discounted exit cost on the target, ψ where V = ψ,
+        and what ``march`` assumed at the horizon. For a tube, the cost of the best moment to stop: the least ψ on the
         way, the largest ``running_max``, or with both the least of max{ψ, largest ``running_max`` so far}.
       reached: the time at which the target was reached, or None.
       code: a PathStatus number.
-      steps: internal steps of the integrator, rejected ones included.
+      steps: internal steps of the integrator, including rejected ones.
       message: one line on how the path ended.
-      promised: V at the start, where the feedback is a Solution or comes of one. The cost in the mean, with what is
-        paid after a path that is cut short, up to errors of the grid and the integrator. Else None.
-      held: whether each control was held through its interval, so that a picture shows steps.
+      promised: V at the start if the feedback has a Solution, otherwise None. V is the mean cost, including the cost
+        after the end of a short path, up to errors of the grid and the integrator.
+      held: True if each control was constant through its interval, so that plots show steps.
     """
 
-    times: Any  # NumPy arrays and numbers of `simulate`, JAX's of `rollout`, with more axes under vmap
+    times: Any  # NumPy arrays and numbers from `simulate`; JAX arrays from `rollout`, with more axes under vmap
     states: Any
     controls: Any
     disturbances: Any
@@ -86,7 +86,7 @@ class Path:
 
     @property
     def status(self) -> PathStatus:
-        """Why the path ends."""
+        """The reason why the path ends."""
         return PathStatus(int(self.code))
 
     def __repr__(self) -> str:
@@ -96,19 +96,19 @@ class Path:
         return f"Path({self.status.name} at t = {end:.6g}, {rows} times, cost {float(self.cost):.6g})"
 
     def __str__(self) -> str:
-        return encodable(self.message)  # a terminal may lack a letter, and print would raise
+        return encodable(self.message)  # a terminal may lack a character, and print would raise
 
 
 def joined(first: Path, then: Path, discount: float) -> Path:
-    """Two paths in one, the second from where and when the first ends, with the running cost of both.
+    """Two consecutive paths as one, with the running cost of both.
 
     Args:
-      first: a path that pays nothing where it ends.
-      then: a path from its last state.
+      first: a path that pays nothing at its end.
+      then: a path that starts from the last state of the first.
       discount: β of the problem.
     """
     end = first.times[-1]
-    # the second path discounts from its own start, which is e^{−β end} of what it counts for the whole
+    # the second path discounts from its own start, so its cost is multiplied by e^{−β end}
     cost, steps = float(first.cost + np.exp(-discount * end) * then.cost), first.steps + then.steps
     said = (
         f"{first.status.message} at t = {end:.6g}; from there {then.status.message} at t = {end + then.times[-1]:.6g}"
@@ -117,7 +117,7 @@ def joined(first: Path, then: Path, discount: float) -> Path:
     return Path(
         times=np.concatenate([first.times, end + then.times[1:]]),
         states=np.concatenate([first.states, then.states[1:]]),
-        # the state in which one ends and the other begins is there once, the controls of intervals all
+        # the state between the two paths appears once, the controls of all intervals are kept
         controls=np.concatenate([first.controls, then.controls]),
         disturbances=None if both else np.concatenate([first.disturbances, then.disturbances]),
         cost=cost,
@@ -131,34 +131,34 @@ def joined(first: Path, then: Path, discount: float) -> Path:
 
 
 def _beside(promised: float | None) -> str:
-    """The words for what V promised, behind the cost."""
+    """The words about V, placed after the cost."""
     return "" if promised is None else f" (V promised {promised:.6g})"
 
 
 def truncate(
     path: Path, count: int, max_steps: int, grid: Grid | None, controls: AdmissibleSet | None, noisy: bool
 ) -> Path:
-    """A path of full length cut where it ends, with its message; one that ends early outside the target warns.
+    """A path of full length truncated at its end, with its message; warns if it ends early outside the target.
 
     Args:
       path: NumPy arrays over all output times.
       count: the number k of intervals before the end.
-      max_steps: the most internal steps that it could make.
-      grid: the box that the feedback is known in, if there is one.
+      max_steps: the largest number of internal steps allowed.
+      grid: the box in which the feedback is known, or None.
       controls: the admissible set of the problem, or None.
-      noisy: True where the steps were fixed in advance, so that their number says nothing of the loop.
+      noisy: True if the steps were fixed in advance, so that their number says nothing about the loop.
     """
     status, times, states = path.status, path.times[: count + 1], path.states[: count + 1]
     applied = path.controls[:count]
     where = f"t = {times[-1]:.6g}"
-    if status in (PathStatus.NONFINITE, PathStatus.UNDEFINED):  # the state is what one looks at to find the fault
+    if status in (PathStatus.NONFINITE, PathStatus.UNDEFINED):  # the state helps to find the fault
         where += f", x = [{', '.join(f'{entry:.4g}' for entry in states[-1])}]"
     said = [
         f"{status.message} at {where}",
         f"cost {float(path.cost):.6g}{_beside(path.promised)}",
         f"{int(path.steps)} internal steps",
     ]
-    # only with clamp=True does a path go on outside; its states are unwound, so that a periodic entry may leave the box
+    # a path continues outside only with clamp=True; its periodic states are unwound, so they may leave the box
     if grid is not None and status != PathStatus.LEFT_BOX:
         outside = np.any(((states < grid.lo) | (states > grid.hi)) & ~np.array(grid.periodic), axis=-1)
         if outside.any():
@@ -167,7 +167,7 @@ def truncate(
         said.append("the feedback jumps or the loop is stiff: hold=dt is faster")
     if _are_inadmissible(controls, applied):
         said.append("controls outside the problem's admissible set were applied as they are")
-    if status not in (PathStatus.DURATION, PathStatus.TARGET, PathStatus.INTERRUPTED):  # that is raised
+    if status not in (PathStatus.DURATION, PathStatus.TARGET, PathStatus.INTERRUPTED):  # an interrupt is raised
         warn(f"simulate: the path {said[0]}", UserWarning)
     return Path(
         times=times,
@@ -185,5 +185,5 @@ def truncate(
 
 
 def _are_inadmissible(controls: AdmissibleSet | None, applied: Array) -> bool:
-    """True if a control lies outside a box or a ball by more than rounding; a finite set is not looked at."""
+    """True if a control is outside a box or a ball by more than rounding; finite sets are not checked."""
     return isinstance(controls, (Box, Ball)) and not np.all(holds(controls, applied))

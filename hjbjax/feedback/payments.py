@@ -1,9 +1,9 @@
-"""What a path pays beside its running cost, and what V promised: where it stops, what is due at its end, and tubes.
+"""Payments of a path besides its running cost, stopping, tubes, and the comparison of the cost with V.
 
     cost = ∫ e^{−βt} L dt + e^{−βτ} · { exit cost on the target; ψ where V = ψ; V(T, ·) at the horizon T of a march }
 
 V(T, ·) is what ``march`` assumed: ``start``, else the terminal cost, else ψ, else g, and never more than ψ. Without
-running cost and noise nothing accumulates along a path, and its cost is that of the best moment to stop,
+running cost and noise nothing accumulates along a path, and its cost is the cost of the best moment to stop,
 
     cost = min over s of max{ e^{−βs} ψ(x(s)), max over r ≤ s of g(x(r)) },
 
@@ -29,24 +29,24 @@ from hjbjax.solution.solution import Solution
 from hjbjax.tracing.closures import settled
 from hjbjax.tracing.components import of_state
 
-MANY = 10  # estimated errors: a path that misses V by more breaks its promise
-LEAST = 0.02  # of the range of V: what a feedback between the nodes may cost more
-UNKNOWN = 0.02  # of the range of V: taken for the error of a value without an estimate
-STILL = 1e-6  # of the box, in the second half of a path that is at rest
-RESTS, SLOWS = 1e-3, 1e-2  # of the box, and of the way in the first half, of one that comes to rest
-AWAY, BACK = 0.5, 0.1  # of the extent of its second half, for a path that goes round inside of a cell
-SAME = 1e-5  # two problems are one whose numbers at a state differ by no more
-FAR = 1.5  # cells: a path that goes round leaves a state by more, and comes back within one
+MANY = 10  # a path whose cost misses V by more than this number of estimated errors breaks the promise
+LEAST = 0.02  # of the range of V: the extra cost allowed for interpolating a feedback between the nodes
+UNKNOWN = 0.02  # of the range of V: the assumed error of a value without an estimate
+STILL = 1e-6  # of the box: the motion, in its second half, of a path that is at rest
+RESTS, SLOWS = 1e-3, 1e-2  # of the box, and of the motion in the first half, for a path that comes to rest
+AWAY, BACK = 0.5, 0.1  # of the extent of its second half, for a path that circles inside a cell
+SAME = 1e-5  # two problems count as the same if their numbers at a state differ by no more than this
+FAR = 1.5  # cells: a circling path moves away from a state by more than this, and returns within one
 
 
 @pytree_dataclass()
 class Lookup:
-    """A function known at the nodes, multilinear between them; called with (t, x), outside that of the nearest point.
+    """A function known at the nodes, multilinear between them; called with (t, x); outside, the nearest point counts.
 
     Args:
       grid: the nodes.
-      values: shape (*grid), with times (k, *grid).
-      times: the kept times of a march, or None.
+      values: shape (*grid), or (k, *grid) with times.
+      times: the stored times of a march, or None.
     """
 
     grid: Grid
@@ -61,15 +61,15 @@ class Lookup:
 
 
 def solution_of(feedback: object) -> Solution | None:
-    """The solution that is a feedback, or from which one comes."""
+    """The Solution of a feedback: the feedback itself, or the Solution from which it was made; otherwise None."""
     solution = feedback if isinstance(feedback, Solution) else getattr(feedback, "solution", None)
     return solution if isinstance(solution, Solution) else None
 
 
 def is_tube(problem: Problem) -> bool:
-    """True if the cost of a path is an extreme along it: a running maximum, or a price of stopping and nothing else.
+    """True if the cost of a path is an extreme along it: a running maximum, or only a cost of stopping.
 
-    With noise the moment to stop must not depend on what follows, so that only a running maximum is an extreme.
+    With noise the moment to stop must not depend on the future, so only a running maximum is an extreme.
     """
     if problem.running_max is not None:
         return True
@@ -77,15 +77,15 @@ def is_tube(problem: Problem) -> bool:
 
 
 def surplus(problem: Problem, feedback: object) -> Lookup | None:
-    """ψ − V between the nodes, zero where one had better stop; None where no path is stopped.
+    """ψ − V between the nodes, zero where stopping is optimal; None if no path is stopped.
 
-    It is zero where V = ψ at every node around, at both kept times around in a march.
+    It is zero where V = ψ at every surrounding node, in a march at both surrounding times.
     """
     solution = solution_of(feedback)
     if problem.stopping_cost is None or is_tube(problem) or solution is None:
         return None
     known = not is_traced(problem, solution)
-    # inside somebody's jit a constant must come out, in the precision of the solution
+    # inside a caller's jit the result must be a constant, in the precision of the solution
     double = np.result_type(solution.value) == np.float64 if known else None
     folded: Any = jax.ensure_compile_time_eval() if known else contextlib.nullcontext()
     with folded, own_settings(x64=double):
@@ -94,9 +94,9 @@ def surplus(problem: Problem, feedback: object) -> Lookup | None:
 
 
 def _surplus(problem: Problem, solution: Solution) -> jax.Array:
-    """ψ − V at the nodes, and at all kept times; with noise its root."""
+    """ψ − V at the nodes and at all stored times; its square root with noise."""
     value, grid = jnp.asarray(solution.value), solution.grid
-    # as in a solve: 1 + c in single precision is another number, and V is not ψ
+    # cast as in a solve: 1 + c in single precision is a different number, and V would not equal ψ
     problem = cast(settled(problem, grid.ndim, value.dtype), value.dtype)
     x = grid.components(value.dtype)
 
@@ -108,15 +108,15 @@ def _surplus(problem: Problem, solution: Solution) -> jax.Array:
     paid = jax.lax.map(price, jnp.asarray(solution.times, value.dtype)) if moving else price(0.0)
     rounding = 16 * jnp.finfo(value.dtype).eps * jnp.max(jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
     left = paid - value - rounding
-    left = jnp.where(jnp.isnan(left), jnp.inf, left)  # neither stops nor arrives
+    left = jnp.where(jnp.isnan(left), jnp.inf, left)  # NaN neither stops nor reaches a target
     if problem.noise is None:
         return left
-    # V fits ψ smoothly, so that ψ − V grows as the square of the distance, of which a bridge between two steps asks
+    # V touches ψ smoothly, so ψ − V grows as the square of the distance; the bridge between steps needs the distance
     return jnp.sqrt(jnp.maximum(left, 0))
 
 
 def value_at_horizon(solution: object) -> Lookup | None:
-    """V at the horizon of a march from ``start=``; None where the problem itself says what is due there."""
+    """V at the horizon of a march with ``start=``; None if the problem itself defines it."""
     found = solution_of(solution)
     if found is None or not found.stats.get("start", False):
         return None
@@ -124,7 +124,7 @@ def value_at_horizon(solution: object) -> Lookup | None:
 
 
 def promise(feedback: object, start: Array, t: float = 0.0) -> float | None:
-    """V at a state, by the solution of a feedback; None where there is none."""
+    """V at a state, from the Solution of a feedback; None without one."""
     solution = solution_of(feedback)
     if solution is None:
         return None
@@ -134,16 +134,16 @@ def promise(feedback: object, start: Array, t: float = 0.0) -> float | None:
 
 
 def still_ahead(problem: Problem, feedback: object, path: Path, *, to_horizon: bool) -> float | None:
-    """What V says is still to be paid after a path that is cut short, discounted to its start.
+    """The cost that V predicts after the end of a short path, discounted to the start of the path.
 
-    A path that rests or goes round outside the target, without a discount, never gets what V promised: nothing is
-    ahead. None where V says nothing of what follows.
+    An undiscounted path that rests or circles outside the target never gets what V promised, so nothing is added. None
+    if V does not predict the cost that follows.
 
     Args:
-      problem: what is simulated.
-      feedback: whose solution knows V.
+      problem: the simulated problem.
+      feedback: the feedback, with a Solution that holds V.
       path: NumPy arrays.
-      to_horizon: True if it lasts as long as the horizon of a march.
+      to_horizon: True if the path is as long as the horizon of a march.
     """
     if path.status is PathStatus.TARGET or to_horizon:
         return 0.0
@@ -158,14 +158,14 @@ def still_ahead(problem: Problem, feedback: object, path: Path, *, to_horizon: b
 
 
 def _rests(path: Path, grid: Grid) -> bool:
-    """True if a path comes to rest: in its second half it hardly moves, next to the box and to its first half."""
+    """True if a path comes to rest: its second half hardly moves, relative to the box and to its first half."""
     middle, box = len(path.states) // 2, np.asarray(grid.hi) - np.asarray(grid.lo)
     early, late = (np.max(np.ptp(part, axis=0) / box) for part in (path.states[: middle + 1], path.states[middle:]))
     return bool(late <= STILL or (late <= RESTS and late <= SLOWS * early))
 
 
 def _goes_round(path: Path, solution: Solution) -> bool:
-    """True if a path comes back in its second half to where it was, and V fell by no more than its error since."""
+    """True if a path returns in its second half to an earlier state, and V fell since by no more than its error."""
     grid, late = solution.grid, path.states[len(path.states) // 2 :]
     value = solution.value_at(late, clamp=True)
     if not value[0] - value[-1] <= _grid_error(solution):
@@ -174,12 +174,12 @@ def _goes_round(path: Path, solution: Solution) -> bool:
     apart = np.abs(late - late[-1])
     apart = np.where(np.array(grid.periodic), np.minimum(apart % width, -apart % width), apart)
     cells = np.max(apart / (width / (np.array(grid.shape) - 1)), axis=1)
-    # a small orbit, inside of a cell, is measured by its own size
+    # a small orbit inside a cell is measured relative to its own size
     return _comes_back(cells, FAR, 1) or _comes_back(cells / max(np.max(cells), 1e-300), AWAY, BACK)
 
 
 def _comes_back(apart: np.ndarray, far: float, near: float) -> bool:
-    """True if distances from the last state were small before the last time that they were large."""
+    """True if distances from the last state were small before the last time at which they were large."""
     away = np.flatnonzero(apart > far)
     return bool(away.size and np.any(apart[: away[-1]] <= near))
 
@@ -187,17 +187,17 @@ def _comes_back(apart: np.ndarray, far: float, near: float) -> bool:
 def broken_promise(
     problem: Problem, feedback: object, path: Path, *, to_horizon: bool, worst_case: bool = True
 ) -> str | None:
-    """A sentence on a path whose cost is not what V promised, by many times the estimated error; or None.
+    """A sentence about a path whose cost differs from V by many times the estimated error; otherwise None.
 
     Args:
-      problem: what is simulated.
-      feedback: whose solution knows V.
+      problem: the simulated problem.
+      feedback: the feedback, with a Solution that holds V.
       path: NumPy arrays, with ``promised``.
-      to_horizon: True if it lasts as long as the horizon of a march.
-      worst_case: True if the disturbance is the solution's own: another one may leave a path cheaper.
+      to_horizon: True if the path is as long as the horizon of a march.
+      worst_case: True if the disturbance is the Solution's own; under another one the path may cost less.
     """
     solution = solution_of(feedback)
-    # one noisy path says nothing of a mean
+    # one noisy path says nothing about the mean cost
     if path.promised is None or solution is None or problem.noise is not None:
         return None
     states = path.states
@@ -214,22 +214,22 @@ def broken_promise(
         return None
     if not _is_answer_to(problem, solution, path):
         return None
-    further = "" if ahead == 0 else f" with what V says of the time after, {ahead:.4g},"
+    further = "" if ahead == 0 else f" with the cost that V predicts afterwards, {ahead:.4g},"
     advice = (
-        "the feedback does not do what V assumes: a finer grid, another scheme, a running cost or a discount helps"
+        "the feedback does not achieve V; use a finer grid, another scheme, a running cost or a discount"
         if off > 0
-        else "V is too large there: a finer grid or a larger box helps"
+        else "V is too large there; use a finer grid or a larger box"
     )
     return f"the path costs {path.cost:.6g},{further} and V promised {path.promised:.6g}: {advice}"
 
 
 def _is_answer_to(problem: Problem, solution: Solution, path: Path) -> bool:
-    """True if V belongs to the problem that is simulated: both problems say the same of the first state of the path.
+    """True if V belongs to the simulated problem: both problems have the same numbers at the first state of the path.
 
-    V of another problem, such as one with a nominal drift or another cost, promises nothing.
+    V of another problem, for example with a nominal drift or another cost, promises nothing.
     """
     posed = solution.problem
-    if posed is None:  # of a file, or made by hand
+    if posed is None:  # loaded from a file or constructed by hand
         return True
     if (posed.is_game, posed.time_dependent) != (problem.is_game, problem.time_dependent) or not len(path.controls):
         return False
@@ -254,7 +254,7 @@ def _number_of(ingredient: Any, arguments: tuple) -> np.ndarray:
 
 
 def _combined(problem: Problem, cost: float, ahead: float) -> float:
-    """The cost of a path with what follows it."""
+    """The total cost of a path and its continuation."""
     if not is_tube(problem) or ahead == 0:
         return cost + ahead
     if problem.stopping_cost is None:
@@ -263,9 +263,9 @@ def _combined(problem: Problem, cost: float, ahead: float) -> float:
 
 
 def _allowed(solution: Solution) -> float:
-    """By how much a path may miss V: many times the estimated error, and what a feedback between the nodes costs."""
+    """The allowed difference between cost and V: many estimated errors, plus the cost of interpolating the feedback."""
     extent = _extent(solution)
-    if extent == 0:  # of a policy without its value, as one made by hand
+    if extent == 0:  # a policy without its value, for example constructed by hand
         return math.inf
     algebraic = solution.error
     algebraic = 0.0 if algebraic is None or not math.isfinite(algebraic) else float(algebraic)
@@ -280,7 +280,7 @@ def _extent(solution: Solution) -> float:
 
 
 def _range_of_extremes(problem: Problem, solution: Solution) -> float:
-    """The range of ψ and g at the nodes, of which a tube takes extremes: V may be the same at all of them."""
+    """The range of ψ and g at the nodes, whose extremes define a tube; V may be constant there."""
     dtype = np.result_type(solution.value)
     when = 0.0 if solution.times is None else float(solution.times[0])
     x = solution.grid.components(dtype)
@@ -292,7 +292,7 @@ def _range_of_extremes(problem: Problem, solution: Solution) -> float:
 
 
 def _grid_error(solution: Solution) -> float:
-    """The largest estimated error of the spacing, or a share of the range of V without an estimate."""
+    """The largest estimated discretisation error, or a share of the range of V without an estimate."""
     found = None if solution.grid_error is None else np.asarray(solution.grid_error)
     if found is None or not np.any(np.isfinite(found)):
         return UNKNOWN * _extent(solution)

@@ -1,4 +1,4 @@
-"""Simulation: ``simulate`` at the host, with checks and a report; ``rollout``, its integration as a pure function."""
+"""Simulation: ``simulate`` with checks and a report, and ``rollout``, its integration as a pure function."""
 
 import dataclasses
 import math
@@ -26,9 +26,9 @@ from hjbjax.tracing.closures import OF_ACTION, OF_STATE, holds_tracers, opened, 
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
 
-INTERVALS = 200  # of the output, where nobody says how many
+INTERVALS = 200  # of the output, by default
 
-_jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # the rows of all intervals are overwritten in place
+_jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # overwrites the rows of all intervals in place
 
 
 @front_door
@@ -50,50 +50,49 @@ def simulate(
     max_step: float | None = None,
     max_steps: int = 100_000,
 ) -> Path:
-    """The path of the closed loop from ``x0``, in float64; inside ``jit``, ``vmap`` and ``grad`` as ``rollout`` has it.
+    """The path of the closed loop from ``x0``, in float64; inside ``jit``, ``vmap`` and ``grad`` it is a ``rollout``.
 
-    Callables take ``(x)``; they take ``(t, x)`` exactly when ``problem.time_dependent``, and feedback and disturbance
-    also when ``time_varying``. Periodic states are
-    wrapped into the grid before anything sees them. Called again with the same functions and shapes, it does
-    not compile again, whatever the numbers.
+    Callables take ``(x)``, or ``(t, x)`` if ``problem.time_dependent``; feedback and disturbance also take ``(t, x)``
+    if ``time_varying``. Periodic states are wrapped into the grid before they are passed to any function. Another call
+    with the same functions and shapes does not compile again, for any numbers.
 
     Args:
       problem: the system and its costs.
       feedback: a Solution, a ``greedy_feedback``, or a function that returns the control, shape (m,). ``None`` if
         there is no control.
-        Where a Solution of a problem with a stopping cost says that one had better stop, V = ψ at all nodes around,
-        the path ends as in a target and pays ψ. Without a running cost and without noise it goes on, and its cost is
-        that of the best moment to stop.
-        A marched Solution must have been kept at enough times: at least ten over the duration. A path that lasts as
-        long as the horizon pays what ``march`` assumed there: ``start``, the terminal cost, else ψ, else g.
+        With a Solution of a problem with a stopping cost, the path ends and pays ψ where stopping is optimal, that is
+        where V = ψ at all surrounding nodes. Without a running cost and without noise it continues, and its cost is the
+        cost of the best moment to stop.
+        A marched Solution must be stored at enough times: at least ten over the duration. A path as long as the horizon
+        pays at its end what ``march`` assumed there: ``start``, the terminal cost, else ψ, else g.
         After a function the terminal cost is paid at the end.
       x0: the state at time 0, shape (n,).
-      duration: how long to run unless the target is reached before, in units of time.
+      duration: the length of the path unless it reaches the target earlier, in units of time.
 
     Keyword Args:
       steps: number of output intervals; ``None`` is 200, or the sampling intervals under ``hold``.
-      disturbance: a function that returns the opponent's d, shape (l,). ``None``: the Solution's own worst case.
-      time_varying: whether feedback and disturbance take ``(t, x)`` though the problem does not depend on time.
-      key: a JAX random key or an integer; wanted exactly when the problem has noise.
+      disturbance: a function that returns the opponent's d, shape (l,). Default: the worst case of the Solution.
+      time_varying: True if feedback and disturbance take ``(t, x)`` although the problem does not depend on time.
+      key: a JAX random key or an integer; required if and only if the problem has noise.
       hold: the sampling interval of a zero-order hold of the control, in units of time; ``False`` for none.
-      grid: the box to stay in, for a feedback that is a function; a Solution brings its own.
-      clamp: outside the box, ``False`` ends the path at the edge; ``True`` goes on with what the feedback says at
-        the nearest point of the box.
+      grid: the box of a feedback that is a function; a Solution has its own grid.
+      clamp: outside the box, ``False`` ends the path at the boundary; ``True`` continues with the feedback at the
+        nearest point of the box.
       rtol: relative error of an internal step.
       atol: absolute error of an internal step, in the units of the state and of the cost.
-      max_step: the longest internal step. ``None``: one output interval; a tenth of it with noise. A target
-        that the path crosses in less time than this may be missed. With noise a target is met between the ends of a
-        step, too, by a draw of the Brownian bridge between them: mean times have the order 1 in this step.
-      max_steps: no internal step is shorter than 2·duration/max_steps, and no more are made.
+      max_step: the longest internal step. Default: one output interval, or a tenth of it with noise. The path may
+        miss a target that it crosses in less time than this. With noise a target can also be met between the ends of a
+        step, by a draw of the Brownian bridge: mean times have order 1 in this step.
+      max_steps: the largest number of internal steps; none is shorter than 2·duration/max_steps.
 
     Returns:
-      A Path. One that ends early, except in the target, warns and says so in its ``status`` and ``message``. One that
-      costs something else than V promised, by many times its estimated error, warns as well.
+      A Path. If it ends early, except in the target, it warns, and ``status`` and ``message`` say why. It also warns if
+      its cost differs from V by many times the estimated error.
 
     Raises:
       ValueError: an argument that is not admissible, or a function that returns the wrong shape.
       TypeError: a feedback or a disturbance that cannot be called.
-      KeyboardInterrupt: Ctrl-C; its ``.path`` is the Path so far, once that has begun.
+      KeyboardInterrupt: Ctrl-C; once the path has begun, ``.path`` is the Path so far.
 
     Example:
       >>> from hjbjax import Box, Problem
@@ -131,19 +130,19 @@ def simulate(
         held=hold is not None,
     )
     key = random_key(problem, key)
-    # Its import adds to JAX's configuration, which is part of the key of every compiled function: once before, or
-    # the second call compiles again.
+    # importing diffrax changes JAX's configuration, which is part of the key of every compiled function; do it before
+    # the first compilation, otherwise the second call compiles again
     import diffrax  # noqa: F401
 
     clock = Clock()
     with noting_interrupts(clock), own_settings(x64=True):
-        loop = cast(loop, np.float64)  # a solution of float32 closes the loop in float64, as the path is integrated
+        loop = cast(loop, np.float64)  # a float32 solution also closes the loop in float64, like the integration
         check_shapes(loop, start)
         if loop.grid is not None and not _margin(loop, start) > 0:
             lo, hi = np.asarray(loop.grid.lo).tolist(), np.asarray(loop.grid.hi).tolist()
             raise ValueError(
-                f"simulate: x0 = {start.tolist()} lies outside the box from {lo} to {hi}, where the feedback is not "
-                "known; start inside, or give clamp=True"
+                f"simulate: x0 = {start.tolist()} is outside the box from {lo} to {hi}, where the feedback is not "
+                "known; start inside, or pass clamp=True"
             )
         path, active = _in_chunks(InitialValueProblem(loop, start, times, key), stepping, clock)
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
@@ -163,26 +162,26 @@ _margin = jax.jit(Loop.margin)
 
 
 def _is_traced(problem: object, *others: Any) -> bool:
-    """True if some number is a tracer, be it one that a function closed over."""
+    """True if some number is a tracer, including the numbers that functions close over."""
     names = (*OF_ACTION, *OF_STATE)
     functions = [getattr(problem, name, None) for name in names] + [each for each in others if callable(each)]
     return is_traced(problem, *others) or any(map(holds_tracers, functions))
 
 
 def _in_chunks(ivp: InitialValueProblem, stepping: Stepping, clock: Clock) -> tuple[Path, jax.Array]:
-    """The path, some output intervals at a time, for about half a second each, until it ends or Ctrl-C is noted."""
+    """The path, computed in chunks of output intervals of about half a second, until it ends or Ctrl-C is pressed."""
     so_far = blank_record(ivp.loop, np.asarray(ivp.x0), np.asarray(ivp.times))
     count, done, chunk = len(ivp.times) - 1, 0, 1
     if clock.interrupted:
         raise KeyboardInterrupt("simulate: interrupted before the path began")
-    so_far, answer = _jit_part(ivp, stepping, so_far, 0, 0)  # no interval: compiled apart from the first pace
-    ending = PathStatus.INTERRUPTED  # what a path is called that has intervals left
+    so_far, answer = _jit_part(ivp, stepping, so_far, 0, 0)  # no interval: compile before the first timing
+    ending = PathStatus.INTERRUPTED  # the status of a path with intervals left
     while ending is PathStatus.INTERRUPTED and done < count and not clock.interrupted:
         began, until = clock.elapsed(), min(done + chunk, count)
         so_far, answer = _jit_part(ivp, stepping, so_far, done, until)
         ending = PathStatus(int(answer[0].code))
-        pace = max(clock.elapsed() - began, 1e-4) / (until - done)  # seconds an interval; a clock may not tick
-        # at most eight times as many as before: the pace of one quick interval says little of those that follow
+        pace = max(clock.elapsed() - began, 1e-4) / (until - done)  # seconds per interval; the clock may be coarse
+        # at most eight times the previous number, because the next intervals may be slower than a quick one
         chunk = int(np.clip(CHUNK_SECONDS / pace, 1, 8 * chunk))
         done = until
     return answer
@@ -208,22 +207,22 @@ def rollout(
 ) -> Path:
     """``simulate`` as a pure function, for ``jit``, ``vmap`` (over keys, starts, parameters), ``grad`` and ``jvp``.
 
-    Follows the dtype of ``x0`` and checks no values. The arrays have full length: after the end of the path
-    times and states repeat the last one, controls are NaN, and ``reached`` is inf if the target was not.
+    Follows the dtype of ``x0`` and does not check values. The arrays have full length: after the end of the path
+    times and states repeat the last entry, controls are NaN, and ``reached`` is inf if the target was not reached.
 
     Args:
       problem: the system and its costs.
       feedback: as in ``simulate``.
       x0: the state at the first time, shape (n,), floating point.
-      times: output times, shape (k+1,), increasing; the first is where discounting starts.
+      times: output times, shape (k+1,), increasing; discounting starts at the first.
 
     Keyword Args:
       disturbance: as in ``simulate``, like ``time_varying``.
-      key: a JAX random key; wanted exactly when the problem has noise.
-      hold: True where the control is held from one output time to the next.
+      key: a JAX random key; required if and only if the problem has noise.
+      hold: True if the control is held from one output time to the next.
       grid: as in ``simulate``, like ``clamp``, ``rtol``, ``atol``, ``max_step`` and ``max_steps``.
-      due: what is paid after the last time: "terminal cost", "V at the horizon" of a march, or "nothing". ``None`` is
-        the terminal cost of a function, V at the horizon of a marched feedback, and nothing of a stationary one.
+      due: the payment after the last time: "terminal cost", "V at the horizon" of a march, or "nothing". Default: the
+        terminal cost for a function, V at the horizon for a marched feedback, nothing for a stationary one.
 
     Returns:
       A Path of JAX arrays without a message.
@@ -244,7 +243,7 @@ def rollout(
     if not jnp.issubdtype(start.dtype, jnp.floating):
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
     key = random_key(problem, key)
-    # numbers that functions close over become leaves: a rule of derivatives sees nothing else
+    # numbers that functions close over become leaves, because derivative rules only cover leaves
     problem = settled(problem, start.size, start.dtype)
     if due is None:
         due = "V at the horizon" if _is_marched(feedback) else "terminal cost"
@@ -265,15 +264,15 @@ def _close(
     time_varying: bool,
     due: str,
 ) -> Loop:
-    """The loop through a Solution, which brings its grid and its worst case, or through functions."""
+    """The loop through a Solution, which has its own grid and worst case, or through functions."""
     if disturbance is not None and not problem.is_game:
         raise ValueError(
             "simulate: got a disturbance, but problem.disturbances is None; give the problem an admissible set"
         )
     control, opponent = None if is_grid_feedback(feedback) else feedback, disturbance
     if is_grid_feedback(feedback):
-        if grid is not None and grid is not feedback.grid:  # its own, said once more, does no harm
-            raise ValueError("simulate: the solution brings its own grid; leave out grid=")
+        if grid is not None and grid is not feedback.grid:  # passing the solution's own grid is allowed
+            raise ValueError("simulate: the solution has its own grid; leave out grid=")
         grid = feedback.grid
         control, worst = lookups(feedback)
         if problem.is_game and disturbance is None and feedback.disturbance is not None:
@@ -291,7 +290,7 @@ def _close(
     for name, function, optional in (("feedback", control, problem.controls is None), ("disturbance", opponent, True)):
         if not callable(function) and not (function is None and optional):
             raise TypeError(f"simulate: {name} is {function!r}, wanted a Solution or a function {signature}")
-    if not (problem.time_dependent or time_varying):  # from here on every player is one of (t, x); lookups are already
+    if not (problem.time_dependent or time_varying):  # from here on all players take (t, x); lookups already do
         control, opponent = (
             jax.tree_util.Partial(timeless, as_partial(player)) if player is not None and player is given else player
             for player, given in ((control, feedback), (opponent, disturbance))
@@ -304,46 +303,46 @@ def _close(
 
 
 def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:
-    """True for a feedback that was kept at some times."""
+    """True for a feedback that is stored at several times."""
     return getattr(feedback, "times", None) is not None
 
 
 def _due(feedback: Feedback, duration: float) -> str:
-    """What is paid at the end of a path: V at the horizon of a march, if the path lasts as long; see ``Loop``.
+    """The payment at the end of a path: V at the horizon of a march, if the path is as long; see ``Loop``.
 
     Raises:
-      ValueError: a marched feedback that is not known well enough up to the duration.
+      ValueError: a marched feedback that is not stored at enough times up to the duration.
     """
     if not _is_marched(feedback):
         return "terminal cost"
     horizon = check_kept(feedback, duration, "simulate: duration")
-    # V at the horizon is owed there, not where a shorter path stops
+    # V at the horizon is due at the horizon, not at the end of a shorter path
     return "nothing" if duration < horizon * (1 - ROUNDING) else "V at the horizon"
 
 
 def _initial_state(x0: object, grid: Grid | None) -> np.ndarray:
-    """The state at the beginning, shape (n,), float64, once it is known to be one."""
+    """The initial state, shape (n,), float64, after checks."""
     try:
         state = np.asarray(x0, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"simulate: x0 is {x0!r}, wanted one number a state") from None
+        raise ValueError(f"simulate: x0 is {x0!r}, wanted one number per state") from None
     if state.ndim != 1 or state.size == 0 or (grid is not None and state.size != grid.ndim):
         wanted = "(n,)" if grid is None else f"({grid.ndim},)"
-        raise ValueError(f"simulate: x0 has shape {state.shape}, wanted {wanted}: one number a state")
+        raise ValueError(f"simulate: x0 has shape {state.shape}, wanted {wanted}: one number per state")
     if not np.all(np.isfinite(state)):
         raise ValueError(f"simulate: x0 is {state.tolist()}, wanted finite numbers")
     return state
 
 
 def _times(duration: float, steps: int | None, hold: float | None) -> np.ndarray:
-    """The output times; under a hold, the sampling instants."""
+    """The output times, or the sampling times under a hold."""
     if hold is None:
         count = INTERVALS if steps is None else arguments.count(steps, "simulate: steps")
         return np.linspace(0.0, duration, 1 + count)
     hold = float(arguments.positive(hold, "simulate: hold", "the sampling interval in units of time"))
     if steps is not None:
         raise ValueError(f"simulate: got steps = {steps} and hold = {hold}; leave out steps: the output is every hold")
-    held = max(1, duration / hold - 1e-9)  # or rounding makes one more interval, of length zero, at the end
-    if held > 10**7:  # 80 MB a state: a hold in another unit than the duration
+    held = max(1, duration / hold - 1e-9)  # otherwise rounding could add an interval of length zero at the end
+    if held > 10**7:  # 80 MB per state: probably a hold in another unit than the duration
         raise ValueError(f"simulate: hold = {hold} makes {held:.3g} intervals of {duration:g}, wanted at most 1e7")
     return np.append(np.arange(math.ceil(held)) * hold, duration)  # the last interval may be shorter

@@ -1,12 +1,11 @@
-"""State estimates and control from them: output feedback.
+"""State estimation and output feedback: observers and controllers that act on measurements.
 
     dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv,    u = control(information state)
 
-Read ``observers`` first: the extended Kalman filter, the Luenberger observer, and how to write one; then
-``information_state``, the law of the state on a grid; ``robust_filter`` for the worst case, with its equation in
-``max_plus``; ``beliefs`` with ``hidden_chain`` for hidden chains of a few states; and ``controllers`` for controls from
-the states of all these. The loop through plant, sensor, observer and control stands with the other closed loops, in
-``hjbjax.feedback.output_feedback``.
+Read ``observers`` first: the extended Kalman filter, the Luenberger observer, and how to write an observer. Then read
+``information_state`` for the law of the state on a grid, ``robust_filter`` for the worst-case filter (its equation is
+in ``max_plus``), ``beliefs`` and ``hidden_chain`` for hidden Markov chains, and ``controllers`` for controllers that
+act on these information states. The closed loop is in ``hjbjax.feedback.output_feedback``.
 """
 
 from hjbjax.feedback.output_feedback import simulate_output

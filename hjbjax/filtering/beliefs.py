@@ -1,24 +1,26 @@
 """Beliefs of a hidden Markov chain as states of a control problem.
 
-A chain of S states jumps with the generator A(u), A_ij the rate from i to j, and is seen through dy = h(x) dt + r dv.
-The belief π_i = P(x = i | what was seen) is a diffusion on the simplex, W. M. Wonham's filter: with the innovation ν,
+A chain of S states jumps with the generator A(u), where A_ij is the rate from i to j. It is measured through
+dy = h(x) dt + r dv. The belief π_i = P(x = i | measurements) is a diffusion on the simplex (W. M. Wonham's filter):
 
-    dπ = A(u)ᵀ π dt + Σ_l π (h_l − ĥ_l)/r_l dν_l,     ĥ = Σ_i π_i h_i,
+    dπ = A(u)ᵀ π dt + Σ_l π (h_l − ĥ_l)/r_l dν_l,     ĥ = Σ_i π_i h_i,     ν the innovation.
 
-and the cost of a control is Σ_i π_i c_i(u): a problem for ``hjb.solve`` whose state is measured. If h depends on u, the
-control also chooses how well it sees: dual control.
+A control costs Σ_i π_i c_i(u). This is a problem for ``hjb.solve`` whose state π is known. If h depends on u, the
+control also chooses the quality of the measurement (dual control).
 
-Two states: x = π₁ in [0, 1], dx = (Aᵀπ)₁ dt + x(1 − x) |h₁ − h₂|/r dν; noise vanishes at both ends, and drift there
-points inwards or is zero. Three or more: one channel of noise moves all of π at once, degenerate and correlated in
-directions that turn with π, which no chain on the spacings of a grid in π represents. In logarithms it is constant:
-with H = h/r and an orthonormal basis B of the vectors with sum zero that makes B H Hᵀ Bᵀ = diag(a₁, …) the state is
+Two states: x = π₁ in [0, 1] with dx = (Aᵀπ)₁ dt + x(1 − x) |h₁ − h₂|/r dν. The noise vanishes at both ends, and the
+drift there points inwards or is zero.
 
-    ζ = B log π,     dζ = B μ dt + √a dw,     μ_i = (Aᵀπ)_i/π_i − ½ Σ_l (H_il − Ĥ_l)²,     π = softmax(Bᵀ ζ),
+Three or more states: one noise channel moves all of π at once. This noise is degenerate, and its direction turns with
+π, so no chain on a grid in π can represent it. In logarithms the noise is constant. With H = h/r and an orthonormal
+basis B of the vectors with sum zero that makes B H Hᵀ Bᵀ = diag(a₁, …) diagonal, the state is
 
-the second term being Ito's. Noise acts along each axis alone, so that the chain is monotone on any spacings. The faces
-of the simplex lie at infinity: the box ends where the smallest π is ``floor`` of the largest, which moves the value by
-about as much as a belief of that size does. There drift is fast, a rate over ``floor`` or more: the default scheme may
-stall at it and say so, and ``hjb.solve(..., scheme=hjb.Upwind())`` is the one to take.
+    ζ = B log π,     dζ = B μ dt + √a dw,     μ_i = (Aᵀπ)_i/π_i − ½ Σ_l (H_il − Ĥ_l)²,     π = softmax(Bᵀ ζ).
+
+The second term of μ is the Itô correction. The noise acts along the axes, so the chain is monotone for any spacings.
+The faces of the simplex lie at infinity; the box ends where the smallest π is ``floor`` times the largest. This
+changes the value by about as much as a belief of size ``floor`` does. The drift near the end is fast, about a rate
+divided by ``floor``. If the default scheme stalls there and reports it, use ``scheme=hjb.Upwind()``.
 """
 
 import dataclasses
@@ -37,8 +39,8 @@ from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, Number, Numbers, State
 
-ROUNDING = 1e-12  # of the size of a generator or a diffusion: what counts as zero there
-LOOKS = 9  # controls of a continuum at which generator, h and cost are looked at
+ROUNDING = 1e-12  # relative to the size of a generator or a diffusion: smaller entries count as zero
+LOOKS = 9  # samples of a continuous control set at which the generator, h and the cost are checked
 
 
 @pytree_dataclass()
@@ -46,14 +48,14 @@ class BeliefCoordinates:
     """The map between beliefs, shape (S,), and the states of a belief problem, shape (S − 1,).
 
     Args:
-      basis: B, shape (S − 1, S), of three or more states; ``None`` of two, whose coordinate is π₁.
+      basis: B, shape (S − 1, S), for three or more states; ``None`` for two, where the coordinate is π₁.
     """
 
     basis: Any = None
 
     @front_door
     def to_belief(self, x: State) -> jax.Array:
-        """π at a state, shape (S,), entries ≥ 0 that sum to one; of states (..., S − 1) shape (..., S)."""
+        """π at a state, shape (S,), entries ≥ 0 with sum one; states (..., S − 1) give shape (..., S)."""
         x = jnp.asarray(x)
         if self.basis is None:
             return jnp.concatenate([x, 1 - x], axis=-1)  # no clip: on the grid x is in [0, 1]
@@ -61,9 +63,9 @@ class BeliefCoordinates:
 
     @front_door
     def from_belief(self, belief: Array) -> jax.Array:
-        """The state of a belief, shape (S − 1,); of beliefs (..., S) shape (..., S − 1).
+        """The state of a belief, shape (S − 1,); beliefs (..., S) give shape (..., S − 1).
 
-        Where a belief is zero and the faces lie at infinity, it is taken as the smallest normal number.
+        In logarithmic coordinates a belief of zero is replaced by the smallest normal number.
         """
         belief = jnp.asarray(belief)
         if self.basis is None:
@@ -77,9 +79,9 @@ class BeliefDynamics:
     """Drift, noise and cost of a belief at one state, with the numbers of the chain as leaves.
 
     Args:
-      coordinates: how beliefs are written.
+      coordinates: the map between states and beliefs.
       generator: A, a function of u that returns shape (S, S).
-      h: what is seen of every state, a function of u that returns shape (S, p), over r.
+      h: the sensor, a function of u that returns h/r, shape (S, p).
       running: c, a function of u that returns shape (S,).
     """
 
@@ -92,10 +94,10 @@ class BeliefDynamics:
         """The rate of change of the state, shape (S − 1,)."""
         rates, belief = self.generator(u), self.coordinates.to_belief(x)
         if self.coordinates.basis is None:
-            # both terms have one sign each, so that rounding never points out at an end
+            # each term has a fixed sign, so rounding cannot make the drift at an end point outwards
             return jnp.stack([rates[1, 0] * belief[1] - rates[0, 1] * belief[0]])
         basis, gains = jnp.asarray(self.coordinates.basis), self.h(u)
-        logs = x @ basis  # log π up to a constant, which the quotients π_j/π_i do not see
+        logs = x @ basis  # log π up to a constant, which cancels in the quotients π_j/π_i
         inflow = jnp.sum(rates * jnp.exp(logs[:, None] - logs[None, :]), axis=0)
         ito = jnp.sum((gains - belief @ gains) ** 2, axis=1) / 2
         return basis @ (inflow - ito)
@@ -118,8 +120,8 @@ class Sensor:
 
     Args:
       h: shape (S,) or (S, p), or a function of u that returns one of these.
-      measurement_noise: r, a number or one a measurement (p,).
-      varies: whether h is a function of u.
+      measurement_noise: r, a number or one per measurement (p,).
+      varies: True if h is a function of u.
     """
 
     h: Any
@@ -136,14 +138,14 @@ class Sensor:
         return self.values(u) / self.measurement_noise
 
     def check(self, name: str, u: Control) -> None:
-        """Refuse a measurement noise that is not one of each measurement; ``name`` is for the refusal."""
+        """Refuse a measurement noise with the wrong number of entries; ``name`` opens the message."""
         wanted = jax.eval_shape(self.values, u).shape[1:]
         if (got := np.shape(self.measurement_noise)) not in ((), wanted):
-            raise ValueError(f"{name}: measurement_noise has shape {got}, wanted () or {wanted}: one a column of h")
+            raise ValueError(f"{name}: measurement_noise has shape {got}, wanted () or {wanted}: one per column of h")
 
 
 class BeliefProblem(NamedTuple):
-    """A control problem whose state is a belief: solve it on its grid, and read it by its coordinates."""
+    """A control problem whose state is a belief, its grid, and the map from its states to beliefs."""
 
     problem: Problem
     grid: Grid
@@ -164,22 +166,21 @@ def belief_problem(
 ) -> BeliefProblem:
     """The control problem of the belief of a hidden chain, its grid, and the map between beliefs and states.
 
-    β V = min_u { Σ_i π_i c_i(u) + (generator of dπ under u) V }: the state is all that is known, and it is measured. V
-    as a function of π is concave, at least the mean Σ_i π_i V_i of the values of a controller that sees the state, and
-    at most the value without measurements.
+    β V = min_u { Σ_i π_i c_i(u) + (generator of dπ under u) V }. V is a concave function of π. It is at least
+    Σ_i π_i V_i, the mean value of a controller that knows the state, and at most the value without measurements.
 
     Args:
       generator: A(u), a function of one control that returns shape (S, S), or the matrix itself: rates per unit time
         from row to column, rows sum to zero.
-      h: what is seen of each state, shape (S,) or (S, p), or a function of u that returns one of these.
+      h: the measured quantity in each state, shape (S,) or (S, p), or a function of u that returns one of these.
       cost: c, a function of one control that returns the cost per unit time in every state, shape (S,).
 
     Keyword Args:
-      controls: the admissible set of u; ``None``: there is no control.
+      controls: the admissible set of u; ``None`` for a chain without a control.
       discount: β > 0, per unit time.
-      measurement_noise: r in dy = h dt + r dv, a number or one a measurement (p,), in the units of h √time.
-      nodes: the number of nodes, or one an axis; ``None``: 201 for two states, 81 an axis for more.
-      floor: for three or more states the smallest belief in the box over the largest.
+      measurement_noise: r in dy = h dt + r dv, a number or one per measurement (p,), in the units of h √time.
+      nodes: the number of nodes, or one number per axis. Default: 201 for two states, 81 per axis for more.
+      floor: for three or more states, the smallest belief in the box relative to the largest.
 
     Returns:
       ``BeliefProblem(problem, grid, coordinates)``.
@@ -187,17 +188,17 @@ def belief_problem(
     Raises:
       ValueError: rates that are negative or rows that do not sum to zero, at some admissible control; shapes that do
         not fit; numbers that are not finite or not positive; for three or more states an h(u) whose noises have no
-        common axes, as two sensors that the control switches between.
-      TypeError: a cost that is no function.
+        common axes, for example two sensors between which the control switches.
+      TypeError: a cost that is not a function.
 
     Example:
       >>> import hjbjax as hjb
-      >>> def generator(u):  # a machine fails at the rate .2 and is repaired at the rate u
+      >>> def generator(u):  # a machine fails at rate 0.2 and is repaired at rate u
       ...     return jnp.stack([jnp.stack([-0.2, 0.2]), jnp.stack([u[0], -u[0]])])
       >>> machine = belief_problem(
       ...     generator, [1.0, 0.0], lambda u: jnp.stack([2 * u[0], 1 + 0 * u[0]]),
       ...     controls=hjb.Finite([[0.0], [2.0]]), discount=0.5, nodes=101,
-      ... )  # repairing a sound machine costs 4 per unit time, a failure 1
+      ... )  # repairing a working machine costs 4 per unit time, a failure 1
       >>> solution = hjb.solve(machine.problem, machine.grid)
       >>> solution.control_at([0.95]).tolist(), solution.control_at([0.05]).tolist()
       ([0.0], [2.0])
@@ -223,12 +224,12 @@ def belief_problem(
 
 
 def chain_functions(generator: Any, h: Any, noise: Any, name: str) -> tuple[Any, Sensor]:
-    """The generator as a function of u, and h over r, with their numbers as leaves; ``name`` is for refusals."""
+    """The generator as a function of u, and h/r, with their numbers as leaves; ``name`` opens the messages."""
     spread: Any = numbers(noise, f"{name}: measurement_noise")
     if not is_traced(spread) and not (spread.ndim <= 1 and np.all(np.isfinite(spread) & (spread > 0))):
         raise ValueError(
-            f"{name}: measurement_noise = {arguments.shown(noise)}; wanted finite numbers > 0, one or one a "
-            "measurement: without noise the state is seen, which is the problem of the chain itself"
+            f"{name}: measurement_noise = {arguments.shown(noise)}; wanted finite numbers > 0, one or one per "
+            "measurement. Without noise the state is known: solve the problem of the chain itself."
         )
     rates = generator if callable(generator) else Constant(numbers(generator, f"{name}: generator"))
     values = as_partial(h) if callable(h) else numbers(h, f"{name}: h")
@@ -247,12 +248,12 @@ class Constant:
 
 
 def _looks(controls: AdmissibleSet | None) -> jax.Array:
-    """Controls at which the functions are looked at, shape (K, m): all of a finite set, samples of a continuum."""
+    """Controls at which the functions are checked, shape (K, m): all of a finite set, samples of a continuous one."""
     return jnp.asarray(np.zeros((1, 0)) if controls is None else sets.samples(controls, LOOKS))
 
 
 def _check_chain(chain: BeliefDynamics, looks: jax.Array) -> int:
-    """The number of states S; refuses what is no chain at one of the controls. Of traced arrays it sees the shapes."""
+    """The number of states S, after checks at each control. Of traced arrays only the shapes are checked."""
     states = 0
     for u in looks:
         rates = chain.generator(u)
@@ -270,16 +271,16 @@ def _check_chain(chain: BeliefDynamics, looks: jax.Array) -> int:
 
 
 def _check_rows(name: str, array: Any, wanted: tuple, u: jax.Array) -> None:
-    """Refuse an array of another shape than those that are wanted, or with numbers that are not finite."""
+    """Refuse an array with a shape not in ``wanted`` or with numbers that are not finite."""
     if np.shape(array) not in wanted:
         shapes = " or ".join(str(each) for each in wanted)
-        raise ValueError(f"belief_problem: {name} has shape {np.shape(array)}, wanted {shapes}: one row a state")
+        raise ValueError(f"belief_problem: {name} has shape {np.shape(array)}, wanted {shapes}: one row per state")
     if not is_traced(array) and not np.all(np.isfinite(np.asarray(array))):
         raise ValueError(f"belief_problem: {name} is not finite at u = {np.asarray(u).tolist()}")
 
 
 def check_generator(rates: np.ndarray, name: str) -> None:
-    """Refuse a matrix that is no generator.
+    """Refuse a matrix that is not a generator.
 
     Raises:
       ValueError: another shape, numbers that are not finite, a negative rate, or a row that does not sum to zero.
@@ -304,32 +305,32 @@ def check_generator(rates: np.ndarray, name: str) -> None:
 
 
 def _common_axes(sensor: Sensor, looks: jax.Array, states: int) -> np.ndarray:
-    """B, shape (S − 1, S): an orthonormal basis of the vectors with sum zero, along which noises are not correlated."""
+    """B, shape (S − 1, S): an orthonormal basis of the vectors with sum zero along which the noise is uncorrelated."""
     seen = [sensor(u) for u in looks]
     if is_traced(seen):
         raise ValueError(
-            f"belief_problem: h or measurement_noise is traced; with {states} states they set the axes of the grid and "
-            "must be known numbers"
+            f"belief_problem: h or measurement_noise is traced; with {states} states they set the axes of the grid, so "
+            "they must be known numbers"
         )
-    # h and h + const tell the same: only differences between states are seen
+    # h and h + const carry the same information: only differences between states count
     centring = np.eye(states) - 1 / states
     covariances = [centring @ gains @ gains.T @ centring for gains in map(np.asarray, seen)]
-    # unequal weights: eigenvectors of a sum are common to all parts only if no two parts make up for each other
+    # unequal weights, so that differences between two covariances cannot cancel in the sum
     weights = [1 / np.sqrt(2 + k) for k in range(len(covariances))]
     size = max(max(np.abs(each).max() for each in covariances), np.finfo(float).tiny)
     mixed = sum(w * c for w, c in zip(weights, covariances, strict=True)) / size
-    # the vector of ones is put far below all others, and left out
+    # subtracting the ones moves their eigenvalue far below all others, so it comes first and is left out
     _, vectors = np.linalg.eigh(mixed - np.ones((states, states)))
     basis = vectors[:, 1:].T[::-1].copy()
-    # eigenvectors have either sign: the largest entry positive, or the axes would turn from machine to machine
+    # the sign of an eigenvector is arbitrary and depends on the machine: make the largest entry positive
     basis *= np.sign(basis[np.arange(states - 1), np.argmax(np.abs(basis), axis=1)])[:, None]
     for covariance, u in zip(covariances, looks, strict=True):
         turned = basis @ covariance @ basis.T
         if np.any(np.abs(turned - np.diag(np.diag(turned))) > 1e3 * ROUNDING * size):
             raise ValueError(
                 f"belief_problem: the noises of h at u = {u.tolist()} and at other controls have no common axes, "
-                f"wanted h(u) h(u)ᵀ/r² that commute: with {states} states let the control change the gain of a sensor, "
-                "h(u) = k(u) h₀, or use two states"
+                f"wanted matrices h(u) h(u)ᵀ/r² that commute. With {states} states let the control change only the "
+                "gain of a sensor, h(u) = k(u) h₀, or use two states."
             )
     return basis
 
@@ -344,6 +345,6 @@ def _box(basis: np.ndarray | None, states: int, nodes: Any, floor: float) -> Gri
     shape = tuple(arguments.count(each, "belief_problem: nodes", 3) for each in shape)
     if basis is None:
         return Grid([0.0], [1.0], shape, names=("π1",))
-    # of all beliefs with π_i ≥ floor·π_j the farthest along b has the logarithms log(1/floor) where b > 0, else 0
+    # the largest b·log π over beliefs with π_i ≥ floor·π_j has log π = log(1/floor) where b > 0, and 0 elsewhere
     reach = np.log(1 / floor) * np.maximum(basis, 0).sum(axis=1)
     return Grid(-reach, reach, shape, names=tuple(f"ζ{axis + 1}" for axis in range(axes)))

@@ -1,14 +1,15 @@
-"""Controllers that see an information state alone, as functions of an observer's state for ``simulate_output``.
+"""Controllers that use only an information state: functions of an observer's state for ``simulate_output``.
 
     certainty equivalence     u = u*(x̂)                                    x̂ the observer's estimate
     averaged Hamiltonian      u = argmin_u ∫ σ(x) [ L(x, u) + f(x, u)·DV(x) + ½ tr(a(x, u) D²V(x)) ] dx
     minimum stress            u = u*(x̄),   x̄ = argmax_x { p(x) + V(x) }
 
-with u* and V those of a feedback that sees the state, σ the law of the state given the record (12.6) and p the robust
-information state (12.10). The first is optimal for a linear plant with quadratic cost and normal noise (W. M. Wonham's
-separation), where the second agrees with it. The second acts as if the state became known in the next instant, so that
-it never acts in order to learn. The third is optimal in the worst case for linear plants with quadratic cost, where
-x̄ = (1 − Y P/γ²)⁻¹ x̂ while the spectral radius of Y P is less than γ² (K. Glover and J. C. Doyle, 1988).
+u* and V are the feedback and the value with a known state, σ is the law of the state given the record (12.6), and p is
+the robust information state (12.10). Certainty equivalence is optimal for a linear plant with quadratic cost and normal
+noise (W. M. Wonham's separation), where the averaged Hamiltonian gives the same control. The averaged Hamiltonian acts
+as if the state became known in the next instant, so it never acts in order to learn. Minimum stress is optimal in the
+worst case for linear plants with quadratic cost, where x̄ = (1 − Y P/γ²)⁻¹ x̂ as long as the spectral radius of Y P is
+less than γ² (K. Glover and J. C. Doyle, 1988).
 
 Source: M. R. James, Nonlinear Control Systems, section 12.
 """
@@ -44,12 +45,12 @@ class AveragedHamiltonian:
     """The controller of ``averaged_hamiltonian``.
 
     Args:
-      problem: whose Hamiltonian is averaged.
-      observer: the filter whose states are seen.
+      problem: the problem whose Hamiltonian is averaged.
+      observer: the filter whose state the controller reads.
       costate: DV at its nodes, n arrays (*grid).
-      bends: D²V at its nodes where noise depends on u, by pairs of axes i ≤ j.
+      bends: D²V at its nodes if the noise depends on u, by pairs of axes i ≤ j.
       counts: 1.0 at the nodes outside the target, 0.0 in it.
-      exact: whether the average is a separable quadratic in u, by the jaxprs.
+      exact: True if the jaxprs show that the average is a separable quadratic in u.
     """
 
     problem: Problem
@@ -61,10 +62,10 @@ class AveragedHamiltonian:
 
     @front_door
     def __call__(self, information: Density) -> Array:
-        """The control, shape (m,); NaN where the law is no law."""
+        """The control, shape (m,); NaN if the density is not a law."""
         self.observer.check_state(information)
-        # compiled even where the caller does not; in one type, since JAX 0.10 confuses programs of NumPy's float64 that
-        # were traced in a ``jit`` of 64 bits with those of 32
+        # compiled even if the caller does not compile. Cast to one type, because JAX 0.10 confuses programs with NumPy
+        # float64 constants that were traced in a 64-bit ``jit`` with 32-bit ones
         return _least(cast(self, information.density.dtype), information)
 
     def _least(self, information: Density) -> Array:
@@ -76,11 +77,11 @@ class AveragedHamiltonian:
 
     @front_door
     def average(self, information: Density, u: Array) -> Scalar:
-        """⟨σ, L(·, u) + f(·, u)·DV + ½ tr(a(·, u) D²V)⟩, but for noise terms without u, in cost per unit time."""
+        """⟨σ, L(·, u) + f(·, u)·DV + ½ tr(a(·, u) D²V)⟩ without noise terms free of u, in cost per unit time."""
         return self._average(self._weights(information), jnp.asarray(u, information.density.dtype))
 
     def _weights(self, information: Density) -> Field:
-        """The probabilities outside the target; where all is inside, all."""
+        """The probabilities outside the target, normalised; all probabilities if all mass is in the target."""
         probability = self.observer.probability(information)
         total = jnp.sum(outside := probability * jnp.asarray(self.counts, probability.dtype))
         return jnp.where(total > 0, outside / jnp.where(total > 0, total, 1), probability)
@@ -123,46 +124,46 @@ class MinimumStress:
 
     @front_door
     def worst_case(self, information: Field) -> State:
-        """x̄, where p + V is largest, shape (n,), refined between the nodes."""
+        """x̄, the state where p + V is largest, shape (n,), refined between the nodes."""
         return self._maximum(information)[1]
 
     @front_door
     def stress(self, information: Field) -> Scalar:
-        """The largest p + V, in the units of cost: what the record admits so far and V lets come."""
+        """The largest p + V, in the units of cost: the worst total of past and future cost."""
         return self._maximum(information)[0]
 
     def judge(self, path: OutputPath) -> None:
-        """Warn where paths of ``simulate_output`` end with the worst case at an end of the box."""
+        """Warn if paths of ``simulate_output`` end with the worst case at an end of the box."""
         with own_settings(x64=True):
             find = jax.vmap(self.worst_case) if np.ndim(path.code) else self.worst_case
             states = np.atleast_2d(find(jnp.asarray(path.information)))
         if np.any(ends := np.any(at_ends(self.grid, states), axis=-1)):
             warn(
                 f"minimum_stress: the worst case is at an end of the box on {np.sum(ends)} of {len(ends)} paths, the "
-                f"first at {np.array2string(states[np.argmax(ends)], separator=', ')}: p + V has no maximum inside; γ "
-                "is too small for filter and feedback together, or V that of another γ, or the box too small",
+                f"first at {np.array2string(states[np.argmax(ends)], separator=', ')}: p + V has no maximum inside.\n"
+                "γ is too small for filter and feedback together, V belongs to another γ, or the box is too small.",
                 UserWarning,
             )
 
     def _maximum(self, information: Field) -> tuple[Scalar, State]:
         if np.shape(information) != self.grid.shape:
             got = np.shape(information) if hasattr(information, "shape") else f"a {type(information).__name__}"
-            raise ValueError(f"minimum_stress: got {got} for p, wanted shape {self.grid.shape}: one number a node")
+            raise ValueError(f"minimum_stress: got {got} for p, wanted shape {self.grid.shape}: one number per node")
         dtype = information.dtype
         return _largest(information + jnp.asarray(self.value, dtype), cast(self.grid, dtype))
 
 
 @front_door
 def certainty_equivalence(observer: Observer, feedback: GridFeedback | Callable) -> jax.tree_util.Partial:
-    """A controller that takes the observer's estimate for the state, u = u*(x̂).
+    """A controller that uses the observer's estimate as if it were the state, u = u*(x̂).
 
     Args:
-      observer: whose state it will see.
+      observer: the observer whose information state the controller receives.
       feedback: a stationary Solution, a ``greedy_feedback``, or a function of the state that returns the control,
         shape (m,). A state beyond the grid gets the control of the nearest point in it.
 
     Returns:
-      A pytree, called with the observer's state. NaN where a Solution has no control, as in its target.
+      A pytree, called with the observer's state. NaN where a Solution has no control, for example in its target.
 
     Raises:
       TypeError: an observer without an estimate, a feedback that cannot be called.
@@ -188,26 +189,26 @@ def _at_estimate(estimate: Callable, feedback: Callable, information: Any) -> Ar
 
 @front_door
 def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFilter) -> AveragedHamiltonian:
-    """A controller that minimises the Hamiltonian averaged over what the filter knows of the state.
+    """A controller that minimises the Hamiltonian averaged over the law of the state.
 
         u = argmin_u ⟨σ, L(·, u) + f(·, u)·DV + ½ tr(a(·, u) D²V)⟩
 
-    Finite sets are enumerated. On a box or a ball the formulas of the minimum hold where the average is a separable
-    quadratic in u, as the jaxprs of drift, cost and noise show; else samples, a pattern search and Newton's method find
-    it. DV is made of central differences, so that kinks of V are smeared over two cells; where V is not finite there
-    are no slopes, and that part of the law is taken for DV = 0. Nodes in the target do not count while there is
-    probability outside it. One control costs a pass over the nodes for every u that is tried.
+    Finite sets are enumerated. On a box or a ball the minimum is in closed form if the jaxprs of drift, cost and noise
+    show that the average is a separable quadratic in u; otherwise samples, a pattern search and Newton's method find
+    it. DV is computed by central differences, which smear kinks of V over two cells. Where V is not finite, DV = 0 is
+    used. Nodes in the target do not count as long as there is probability outside it. One control costs one pass over
+    the nodes for every u tried.
 
     Args:
-      problem: what was solved.
-      solution: what ``solve`` returned for it, with every state controlled.
-      observer: the filter; its grid need not be that of the solution, in whose box it must lie.
+      problem: the problem that was solved.
+      solution: the result of ``solve``, in which every state has a control.
+      observer: the filter; its grid may differ from the solution's grid, but must lie in the same box.
 
     Returns:
-      A pytree, called with the filter's state; ``.average(state, u)`` is what is minimised.
+      A pytree, called with the filter's state; ``.average(state, u)`` is the minimised average.
 
     Raises:
-      TypeError: no Problem, no Solution, no GridFilter.
+      TypeError: an argument that is not a Problem, a Solution or a GridFilter.
       ValueError: a game, no controls, functions that depend on time, a marched solution, grids that do not fit.
 
     Example:
@@ -215,9 +216,9 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
       >>> plant = hjb.Problem(lambda x, u: u, lambda x, u: 0.5 * (x @ x + u @ u), hjb.Box([-3.0], [3.0]), noise=0.5)
       >>> grid = hjb.Grid([-4.0], [4.0], (41,))
       >>> x = grid.axis(0)
-      >>> known = hjb.Solution(grid, 0.5 * x**2, -x[:, None])  # up to a constant; else ``hjb.solve``
+      >>> known = hjb.Solution(grid, 0.5 * x**2, -x[:, None])  # up to a constant; usually from ``hjb.solve``
       >>> observer = GridFilter(plant, lambda x: x, grid, lambda x: jnp.exp(-2 * (x - 0.5) @ (x - 0.5)))
-      >>> round(float(averaged_hamiltonian(plant, known, observer)(observer.initial())[0]), 3)  # less the mean
+      >>> round(float(averaged_hamiltonian(plant, known, observer)(observer.initial())[0]), 3)  # minus the mean
       -0.5
     """
     name = "averaged_hamiltonian"
@@ -227,13 +228,13 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
     if problem.is_game or problem.time_dependent or problem.controls is None:
         what = "disturbances" if problem.is_game else "no controls" if problem.controls is None else "a time"
         raise ValueError(
-            f"{name}: got a problem with {what}, wanted one player whose functions take (x, u); for a game see "
-            "minimum_stress, and make the time a state with drift 1"
+            f"{name}: got a problem with {what}, wanted one player whose functions take (x, u). For a game use "
+            "minimum_stress; to replace a time, add a state with drift 1."
         )
     _check_stationary(solution, name)
     check_box(solution.grid, observer.grid, name)
     if not is_traced(solution.value) and (bad := int(np.sum(np.isnan(solution.value)))):
-        raise ValueError(f"{name}: V is NaN at {bad} nodes, wanted numbers, infinite where the target is out of reach")
+        raise ValueError(f"{name}: V is NaN at {bad} nodes, wanted numbers, or infinity if the target is unreachable")
     grid, n = observer.grid, observer.grid.ndim
     problem = closures.settled(problem, n)
     checks.of_one_state(problem, n, "the number of axes of the filter's grid")
@@ -256,34 +257,34 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
 def minimum_stress(
     observer: RobustGridFilter, solution: Solution, *, feedback: GridFeedback | Callable | None = None
 ) -> MinimumStress:
-    """A controller that acts as in the worst state, where p + V is largest: what was seen and what is to come.
+    """A controller that acts as if the state were the worst one, where past plus future cost p + V is largest.
 
         u = u*(x̄),    x̄ = argmax_x { p(x) + V(x) }
 
-    V is the value of the H∞ game with the filter's γ and σ, ``attenuation(problem, gamma, disturbances,
-    enters=sigma)``. A γ that is too small for both Riccati equations together leaves p + V no maximum inside: x̄ runs
-    to an end of the box, of which ``simulate_output`` warns.
+    V is the value of the H∞ game with the γ and σ of the filter, ``attenuation(problem, gamma, disturbances,
+    enters=sigma)``. If γ is too small for both Riccati equations together, p + V has no maximum inside and x̄ runs to
+    an end of the box. ``simulate_output`` then warns.
 
     Args:
-      observer: the robust filter; its grid need not be that of the solution, in whose box it must lie.
-      solution: V; of a marched one the earliest kept time counts, where it should have settled.
+      observer: the robust filter; its grid may differ from the solution's grid, but must lie in the same box.
+      solution: V; of a marched solution the earliest stored time is used, at which V should have settled.
 
     Keyword Args:
-      feedback: u*, a function of the state or a ``greedy_feedback``; ``None``: the solution's control.
+      feedback: u*, a function of the state or a ``greedy_feedback``. Default: the solution's control.
 
     Returns:
       A pytree, called with the filter's state; ``.worst_case(state)`` is x̄, ``.stress(state)`` the largest p + V.
 
     Raises:
-      TypeError: no RobustGridFilter, no Solution, a feedback that cannot be called.
-      ValueError: grids that do not fit, a V that is not finite at a node of the filter.
+      TypeError: an argument that is not a RobustGridFilter or a Solution, or a feedback that cannot be called.
+      ValueError: grids that do not fit, or a V that is not finite at a node of the filter.
 
     Example:
       >>> import hjbjax as hjb
       >>> plant = hjb.Problem(lambda x, u: u - x, lambda x, u: 0.5 * (x @ x + u @ u), hjb.Box([-3.0], [3.0]))
       >>> grid = hjb.Grid([-2.0], [2.0], (41,))
       >>> x = grid.axis(0)
-      >>> known = hjb.Solution(grid, 0.25 * x**2, -0.5 * x[:, None])  # else of ``hjb.attenuation(plant, 2.0, ...)``
+      >>> known = hjb.Solution(grid, 0.25 * x**2, -0.5 * x[:, None])  # usually ``hjb.attenuation(plant, 2.0, ...)``
       >>> observer = RobustGridFilter(plant, lambda x: x, grid, lambda x: -2 * (x - 0.5) @ (x - 0.5), 2.0)
       >>> control = minimum_stress(observer, known)
       >>> round(float(control.worst_case(observer.initial())[0]), 4), round(float(control(observer.initial())[0]), 4)
@@ -308,18 +309,18 @@ def minimum_stress(
             state = np.array2string(grid.state(tuple(int(i) for i in bad[0])), separator=", ")
             raise ValueError(
                 f"{name}: V is not finite at {len(bad)} nodes of the filter, the first {state}, where p + V has no "
-                "maximum; take a smaller box for the filter"
+                "maximum; use a smaller box for the filter"
             )
     return MinimumStress(grid, value, acts)
 
 
 def _double(*trees: Any) -> Any:
-    """float64, but not in the middle of somebody's trace."""
+    """Settings for float64, except in a caller's float32 trace."""
     return own_settings(x64=jnp.result_type(float) == np.float64 or not is_traced(*trees))
 
 
 def _stationary(feedback: Any, name: str) -> Callable:
-    """A feedback as a pytree that is called with the time, which does not matter, and the state."""
+    """A feedback as a pytree that is called with the time, which is ignored, and the state."""
     if is_grid_feedback(feedback):
         _check_stationary(feedback, name)
         return jax.tree_util.Partial(_wrapped, feedback.grid, lookups(feedback)[0])
@@ -337,16 +338,16 @@ def _of_state(function: Callable, t: Number, x: State) -> Array:
 
 
 def _check_stationary(solution: GridFeedback, name: str) -> None:
-    """Refuse what was marched: a controller is not told the time."""
+    """Refuse a marched solution: a controller does not receive the time."""
     if solution.times is not None:
         raise ValueError(
-            f"{name}: got a marched solution, wanted a stationary one: the information state does not hold the time; "
-            "give simulate_output the solution itself for certainty equivalence, or make the time a state with drift 1"
+            f"{name}: got a marched solution, wanted a stationary one: the information state does not hold the time.\n"
+            "For certainty equivalence pass the solution to simulate_output, or make the time a state with drift 1."
         )
 
 
 def _slopes(solution: Solution, grid: Grid) -> Array:
-    """DV at the nodes of a grid, shape (*grid, n), zero where V has none."""
+    """DV at the nodes of a grid, shape (*grid, n); zero where V has no finite slope."""
     slopes = solution.costate_at(states_of(grid), clamp=True)
     return jnp.where(jnp.isfinite(slopes), slopes, 0)
 
@@ -356,5 +357,5 @@ def _bends(solution: Solution, grid: Grid) -> dict[tuple[int, int], Costate]:
     n = grid.ndim
     slopes = _slopes(solution, solution.grid)
     rows = [_slopes(dataclasses.replace(solution, value=slopes[..., i]), grid) for i in range(n)]
-    # mixed differences commute on an even grid; their mean is symmetric on any
+    # mixed differences commute on a uniform grid; their mean is symmetric on any grid
     return {(i, j): (rows[i][..., j] + rows[j][..., i]) / 2 for i in range(n) for j in range(i, n)}

@@ -1,25 +1,23 @@
-"""The forward equation ∂p/∂t = 𝓛*p on a grid: where the chain under one control is after some time.
+"""The forward equation ∂p/∂t = 𝓛*p on a grid, and the mean, covariance and mode of a law.
 
-𝓛* is the transposed generator, so that Σ p is kept and p ≥ 0 stays so: with sub-steps τ ≤ 1/max Q every
+𝓛* is the transposed generator of the chain under one control, so Σ p is conserved and p stays ≥ 0. With sub-steps
+τ ≤ 1/max Q, each
 
     p ← p + τ 𝓛*p
 
-is a step of a Markov chain, and the mean of p and of two of them, ½ p + ½ (1 + τ𝓛*)² p, K. Heun's, is of second
-order in τ. The number of sub-steps is the least, ⌈dt max Q⌉, so that a step of any length is admissible; each costs two
-passes over the nodes. Along axes whose noise is too small for central differences ``transport`` takes the diffusion of
-upwinding away, in sub-steps that are up to half as long.
+is a step of a Markov chain. Heun's mean ½ p + ½ (1 + τ𝓛*)² p has order 2 in τ. There are ⌈dt max Q⌉ sub-steps, the
+fewest that are stable, so dt may have any length; each sub-step costs two passes over the nodes. Along axes whose noise
+is too small for central differences, ``transport`` removes the diffusion of upwinding, in sub-steps up to half as long.
 
-The chain's law is a probability at each node. Its density is that over the node's cell: half a cell at a wall on which
-noise reflects, a whole one at an end of an axis without noise, see ``chain.stationary_density``.
+The law of the chain is one probability per node. The density is the probability divided by the cell of the node: half a
+cell at a wall where noise reflects, a whole cell at an end of an axis without noise, see ``chain.stationary_density``.
 
-Mean, covariance and mode of probabilities at the nodes of a grid.
-
-Along a periodic axis of length L the mean is the circular one,
+Along a periodic axis of length L the mean is the circular mean,
 
     lo + L/2π arg Σ p e^{2πi (x − lo)/L},
 
-brought into the box, and differences from it are taken the short way round, in [−L/2, L/2). Where the sum vanishes, as
-of a uniform law, there is no direction and the mean is ``lo``.
+wrapped into the box. Differences from it are taken the short way round, in [−L/2, L/2). If the sum vanishes, as for a
+uniform law, the mean is ``lo``.
 """
 
 from typing import Any
@@ -36,7 +34,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import known
 from hjbjax.problem.types import Array, Control, Field, Number, State
 
-MOST = 10_000_000  # sub-steps; a law that moves by a cell in each is at rest on any grid that fits in memory
+MOST = 10_000_000  # sub-steps: enough for a law to come to rest on any grid that fits in memory, one cell per sub-step
 
 
 def substeps(on: Discretisation, u: Control, dt: Number, axes: tuple[int, ...] = ()) -> jax.Array:
@@ -56,7 +54,7 @@ def _leaving(jumps: Rates, corrected: list[Correction]) -> Any:
 
 def _count(leaving: Field, dt: Number) -> jax.Array:
     wanted = jnp.ceil(jnp.max(leaving) * dt)
-    # rates that are not finite make no count; the probabilities that they make say so
+    # rates that are not finite give no count; take one sub-step, whose result is then not finite either
     return jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, 1, MOST + 1), 1).astype(jnp.int32)
 
 
@@ -69,17 +67,17 @@ def advanced(
     *,
     axes: tuple[int, ...] = (),
 ) -> Field:
-    """The probabilities at the nodes after the time dt under the control u (m,): their sum is kept, none negative.
+    """The probabilities at the nodes after the time dt under the control u (m,): ≥ 0, with the same sum.
 
-    NaN where more than ``MOST`` sub-steps are needed.
+    NaN if more than ``MOST`` sub-steps are needed.
 
     Args:
       on: the chain.
       probability: at the nodes, shape (*grid).
       u: the control, shape (m,).
       dt: the time.
-      most: the number of sub-steps, which must be enough: a loop of known length has a reverse derivative, too.
-      axes: the axes along which the diffusion of upwinding is taken away.
+      most: the number of sub-steps, at least the number needed. A loop of known length has a reverse derivative.
+      axes: the axes along which the diffusion of upwinding is removed.
     """
     dtype = probability.dtype
     entries = _entries(u, dtype)
@@ -88,7 +86,7 @@ def advanced(
     count = _count(_leaving(jumps, corrected), dt) if most is None else most
     probability = jnp.where(jnp.asarray(count) > MOST, jnp.nan, probability)
     tau = jnp.asarray(dt / count, dtype)
-    stays = jnp.maximum(1 - tau * jumps.total(), 0)  # of the fastest node 1 − 1, which may round below zero
+    stays = jnp.maximum(1 - tau * jumps.total(), 0)  # for the fastest node 1 − 1, which may round below zero
     moves = arriving.scaled(tau)
     corrected = [each._replace(rate=tau * each.rate) for each in corrected]
 
@@ -96,18 +94,18 @@ def advanced(
         found = _moved(on, stays, moves, p)
         for correction in corrected:
             found = found + gained(on.grid, correction, p)
-        # fluxes that cancel to zero may round below it
+        # fluxes that cancel may leave a negative rounding error
         return jnp.maximum(found, 0) if corrected else found
 
     def substep(_: int, p: Field) -> Field:
         return (p + moved(moved(p))) / 2
 
-    # of more than MOST none is made: what comes back says so
+    # with more than MOST sub-steps needed, none is made and the result is NaN
     return jax.lax.fori_loop(0, jnp.where(count > MOST, 0, count) if most is None else most, substep, probability)
 
 
 def _moved(on: Discretisation, stays: Field, moves: Rates, p: Field) -> Field:
-    """The probabilities after one jump of the chain at most."""
+    """The probabilities after at most one jump of the chain."""
     found = stays * p
     for offset, share in zip(moves.offsets, moves.values, strict=True):
         found = found + share * stencil.neighbour(p, on.grid, offset, ghost=False)
@@ -117,7 +115,7 @@ def _moved(on: Discretisation, stays: Field, moves: Rates, p: Field) -> Field:
 def cells(on: Discretisation) -> Array:
     """The cell of every node for the law of the chain, shape (*grid), in the units of the states.
 
-    Noise that depends on the control counts with its value at zero control.
+    Noise that depends on the control is evaluated at zero control.
     """
     grid, sizes = on.grid, on.grid.volumes()
     m = 0 if on.problem.controls is None else on.problem.controls.dim
@@ -145,7 +143,7 @@ def covariance(grid: Grid, probability: Field) -> jax.Array:
 
 
 def mode(grid: Grid, density: Field) -> State:
-    """The node at which a density is largest, shape (n,); the first of equals."""
+    """The first node at which a density is largest, shape (n,)."""
     index = jnp.unravel_index(jnp.argmax(density), grid.shape)
     return jnp.stack([jnp.asarray(grid.axis(axis, density.dtype), density.dtype)[i] for axis, i in enumerate(index)])
 
@@ -164,7 +162,7 @@ def _mean_along(grid: Grid, axis: int, probability: jax.Array) -> jax.Array:
     angle = 2 * np.pi * (x - lo) / (hi - lo)
     turn = jnp.arctan2(probability @ jnp.sin(angle), probability @ jnp.cos(angle)) / (2 * np.pi)
     place = lo + (hi - lo) * jnp.mod(turn, 1)
-    return jnp.where(place >= hi, lo, place)  # just below zero, the remainder rounds up to a whole turn
+    return jnp.where(place >= hi, lo, place)  # an angle just below zero can round up to a whole turn
 
 
 def _difference(grid: Grid, axis: int, center: jax.Array, dtype: np.dtype) -> jax.Array:

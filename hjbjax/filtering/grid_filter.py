@@ -1,15 +1,15 @@
-"""The law of the state given what was measured, on a grid, step by step: an ``Observer`` for any drift, noise and h.
+"""Grid filter: the law of the state given the measurements, for any drift, noise and h.
 
-A step of length dt of the Duncan–Mortensen–Zakai equation is split as G. Strang did,
+A step of length dt of the Duncan–Mortensen–Zakai equation is split symmetrically (G. Strang),
 
-    q ← e^{ℓ/2} q,    q ← e^{𝓛* dt} q,    q ← e^{ℓ/2} q,    ℓ = hᵀR⁻¹dy − ½ hᵀR⁻¹h dt,
+    q ← e^{ℓ/2} q,    q ← e^{𝓛* dt} q,    q ← e^{ℓ/2} q,    ℓ = hᵀR⁻¹dy − ½ hᵀR⁻¹h dt.
 
-where the factors are exact for a state that rests, and the middle step keeps sums and signs, see ``forward_equation``:
-q ≥ 0 for any dt and any record. Of second order in dt along a smooth record; the likelihood of a record with noise is
-of first order, since an increment does not tell where in its interval the noise was. Of second order in the spacing
-where the law is smooth, by central differences or by a limited flux, see ``transport``. The factors are multiplied as
-logarithms, with the largest product taken out, so that nothing overflows or vanishes. What is taken out is kept in the
-logarithm of the mass.
+The factors are exact for a state that does not move. The middle step conserves mass and keeps q ≥ 0 for any dt and any
+record, see ``forward_equation``. The splitting has order 2 in dt along a smooth record. The likelihood of a noisy
+record has order 1, because an increment does not show when within its interval the noise arrived. In space the order
+is 2 where the law is smooth, by central differences or a limited flux, see ``transport``. The factors are multiplied as
+logarithms after subtracting the largest product, so nothing overflows or vanishes. The subtracted logarithms add up to
+the log-likelihood.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,7 +43,7 @@ class Density:
 
     Args:
       density: at the nodes, (*grid), in 1/(units of the states); ``sum(density * grid.volumes())`` is 1.
-      log_likelihood: log ∫q, of the record against that of noise alone.
+      log_likelihood: log ∫q, the log-likelihood of the record relative to pure noise.
     """
 
     density: Any
@@ -52,30 +52,30 @@ class Density:
 
 @pytree_dataclass(static=("axes",))
 class GridFilter:
-    """The law of the state given what was measured, on a grid: an ``Observer`` for any drift, noise and h.
+    """The law of the state given the measurements, on a grid: an ``Observer`` for any drift, noise and h.
 
-    One update is a step of the Duncan–Mortensen–Zakai equation (12.6), see ``zakai``. Its state is a ``Density``. The
-    state of the plant stays on the grid: the box must hold it, with room to spare. A step costs
-    2⌈dt max Q⌉ passes over the nodes, with Q = Σ |f_i|/h_i + a_ii/h_i² the rate at which the chain leaves a node;
-    |f_i|/h_i counts twice along axes with little noise or none, where the flux is limited.
+    One update is a step of the Duncan–Mortensen–Zakai equation (12.6), see ``zakai``. The information state is a
+    ``Density``. The box must contain the state of the plant, with room to spare. A step costs 2⌈dt max Q⌉ passes over
+    the nodes, where Q = Σ |f_i|/h_i + a_ii/h_i² is the rate at which the chain leaves a node. |f_i|/h_i counts twice
+    along axes with little or no noise, where the flux is limited.
 
     Args:
-      problem: the plant: its drift, controls and noise matter.
+      problem: the plant; only its drift, controls and noise are used.
       h: the measured function of one state, returns shape (p,).
       grid: the nodes.
-      initial_density: of the state at t = 0: a function of one state that returns a number ≥ 0, or (*grid). It need
-        not be normalised.
+      initial_density: the density of the state at t = 0, a function of one state that returns a number ≥ 0, or (*grid).
+        It need not be normalised.
 
     Keyword Args:
       measurement_noise: r in dy = h(x) dt + r dv: a number, (p,) or (p, p).
 
     Raises:
-      ValueError: a game, a problem that depends on time, open ends, functions of the wrong shape or that are not finite
-        at a node, noise that the chain cannot represent, an initial density that is none.
-      TypeError: no Problem, no Grid, an h that cannot be called.
+      ValueError: a game, a problem that depends on time, open ends, functions that have the wrong shape or are not
+        finite at a node, noise that the chain cannot represent, or an initial density that is negative or zero.
+      TypeError: an argument that is not a Problem or a Grid, or an h that cannot be called.
 
-    Warns outside ``jit`` and ``vmap`` if the law is narrower than a cell, or if dt is longer than r/(σ|h'|), and names
-    the spacing or the dt that is enough.
+    Warns outside ``jit`` and ``vmap`` if the law is narrower than a cell or if dt is longer than r/(σ|h'|). The warning
+    names a sufficient spacing or dt.
 
     Example:
       >>> grid = Grid([-3.0], [3.0], (61,))
@@ -92,7 +92,7 @@ class GridFilter:
     prior: Any  # the density at t = 0, (*grid)
     volumes: Any  # of the nodes, (*grid)
     cells: Any  # of the chain's law, (*grid)
-    axes: tuple[int, ...]  # along which the noise is too small for central differences, see ``transport``
+    axes: tuple[int, ...]  # where the noise is too small for central differences, see ``transport``
 
     @front_door
     def __init__(
@@ -115,7 +115,7 @@ class GridFilter:
             )
         system = plant(problem, grid.ndim, name)
         measured = measurement(h, grid.ndim, measurement_noise, name)
-        # inside ``jit`` as well, what is known is computed here and now
+        # numbers that are known inside ``jit`` are computed at once, not traced
         with own_settings(x64=True), jax.ensure_compile_time_eval():
             on = Discretisation(*cast((system, grid), np.float64), Upwind(), np.dtype(np.float64))
             axes = tuple(range(grid.ndim)) if is_traced(system, grid) else _check_rates(on, name)
@@ -134,13 +134,13 @@ class GridFilter:
 
     @front_door
     def initial(self) -> Density:
-        """The law at t = 0, of likelihood one."""
+        """The law at t = 0, with likelihood one."""
         density = jnp.asarray(self.prior, jnp.result_type(float))
         return Density(density, jnp.zeros((), density.dtype))
 
     @front_door
     def update(self, state: Density, u: Control, dy: Array | None, dt: Number) -> Density:
-        """The law after holding the control u (m,) for dt and seeing the increment dy (p,), or nothing (None)."""
+        """The law after applying the control u (m,) for dt and measuring the increment dy (p,), or None."""
         self.check_state(state)
         check_step("GridFilter.update", self.plant, self.measurement.dim, (u, dy, dt))
         after = self._after(state, u, dy, dt)
@@ -157,7 +157,7 @@ class GridFilter:
           y: the sample, shape (p,), in the units of h.
 
         Keyword Args:
-          measurement_noise: s, a number, (p,) or (p, p), in the units of h: standard deviations.
+          measurement_noise: s, a number, (p,) or (p, p), standard deviations in the units of h.
 
         Raises:
           ValueError: a sample or a noise of the wrong shape, or not finite.
@@ -166,7 +166,7 @@ class GridFilter:
         self.check_state(state)
         sampled = sample_of(self.measurement, y, measurement_noise, name)
         dtype = state.density.dtype
-        # the signal is r⁻¹ h: back to h, and into units of s
+        # the signal is r⁻¹ h: convert it back to h, then to units of s
         h = jnp.tensordot(jnp.asarray(self.measurement.root, dtype), jnp.asarray(self.signal, dtype), 1)
         signal = sampled.whitened(h.reshape(len(h), -1)).reshape(h.shape)
         seen = sampled.whitened(jnp.asarray(y, dtype))
@@ -178,12 +178,12 @@ class GridFilter:
         return after
 
     def warn_if_coarse(self, name: str, densities: np.ndarray, dt: float) -> None:
-        """Warn where a law is narrower than a cell, or where it is forgotten within a step.
+        """Warn if a law is narrower than a cell, or if the noise of the state undoes a measurement within a step.
 
         Args:
-          name: the function called.
+          name: the function the user called.
           densities: the law at some times, shape (k, *grid).
-          dt: the time between two measurements; 0 for a sample.
+          dt: the time between two measurements, or 0 for a sample.
         """
         with own_settings(x64=True), jax.ensure_compile_time_eval():
             masses = np.asarray(densities, np.float64) * np.asarray(self.cells)
@@ -191,7 +191,7 @@ class GridFilter:
             resolution.warn_if_coarse(name, self._on(np.dtype(np.float64)), np.asarray(self.signal), laws, dt)
 
     def _after(self, state: Density, u: Control, dy: Array | None, dt: Number, most: int | None = None) -> Density:
-        """The law a step later, by ``most`` sub-steps if their number is to be known beforehand."""
+        """The law one step later, with ``most`` sub-steps if their number must be known beforehand."""
         dtype = state.density.dtype
         dt, u = jnp.asarray(dt, dtype), jnp.asarray(u, dtype)
         if dy is None:
@@ -199,7 +199,7 @@ class GridFilter:
             return Density(self._density(moved), state.log_likelihood)
         signal = jnp.asarray(self.signal, dtype)
         seen = self.measurement.whitened(jnp.asarray(dy, dtype))
-        # half of ℓ, before the state moves and after it
+        # half of ℓ before the state moves, half after
         half = (jnp.tensordot(seen, signal, 1) - jnp.sum(signal**2, axis=0) * (dt / 2)) / 2
         probability, before = _weighed(self.probability(state), half)
         probability = advanced(self._on(dtype), probability, u, dt, most, axes=self.axes)
@@ -218,7 +218,7 @@ class GridFilter:
 
     @front_door
     def probability(self, state: Density) -> Field:
-        """The probability of each node of the chain, shape (*grid), of sum 1: the density times the node's cell."""
+        """The probability of each node, shape (*grid), with sum 1: the density times the cell of the node."""
         self.check_state(state)
         mass = state.density * jnp.asarray(self.cells, state.density.dtype)
         return mass / jnp.sum(mass)
@@ -229,7 +229,7 @@ class GridFilter:
         return forward_equation.mode(self.grid, state.density)
 
     def check_state(self, state: Density) -> None:
-        """Refuse the state of another filter, or of this one on another grid."""
+        """Refuse the state of another filter or of another grid."""
         if not isinstance(state, Density) or np.shape(state.density) != self.grid.shape:
             got = f"shape {np.shape(state.density)}" if isinstance(state, Density) else f"a {type(state).__name__}"
             raise ValueError(f"GridFilter: got {got} for the state, wanted a Density of shape {self.grid.shape}")
@@ -243,22 +243,22 @@ class GridFilter:
 
 
 def warn_at_ends(name: str, grid: Grid, places: Array, dt: float, what: str) -> None:
-    """Warn where an estimate lies at an end of the box, beyond which nothing is known.
+    """Warn if an estimate is at an end of the box, where the filter cannot follow the state.
 
     Args:
-      name: who asks.
+      name: the function the user called.
       grid: the nodes.
       places: the estimates along a record, shape (..., k, n).
-      dt: the time between two of them.
-      what: of which kind they are.
+      dt: the time between two estimates.
+      what: the name of the estimate.
     """
     if not np.any(off := at_ends(grid, places)):
         return
     *_, step, axis = np.argwhere(off)[np.argmin(np.argwhere(off)[:, -2])]
     warn(
-        f"{name}: {what} lies at an end of the box of axis {axis} after {np.sum(np.any(off, axis=-1))} of "
-        f"{off[..., 0].size} measurements, the first at t = {(step + 1) * dt:.6g}: beyond it nothing is known; if the "
-        "state can leave the box take a larger one, else there is none to heed",
+        f"{name}: {what} is at an end of the box on axis {axis} after {np.sum(np.any(off, axis=-1))} of "
+        f"{off[..., 0].size} measurements, first at t = {(step + 1) * dt:.6g}.\n"
+        "The filter knows nothing beyond the box. If the state can leave it, use a larger box; otherwise ignore this.",
         UserWarning,
     )
 
@@ -276,27 +276,27 @@ def states_of(grid: Grid) -> Array:
 
 
 def check_box(known: Grid, asked: Grid, name: str) -> None:
-    """Refuse a filter on states where the solution is not known."""
+    """Refuse a filter whose grid extends beyond the grid of the solution."""
     if known.ndim != asked.ndim or known.periodic != asked.periodic:
         raise ValueError(
-            f"{name}: the solution's grid has {known.ndim} axes, periodic {known.periodic}, and the filter's "
-            f"{asked.ndim}, {asked.periodic}; wanted the same axes"
+            f"{name}: the solution's grid has {known.ndim} axes, periodic {known.periodic}, and the filter's grid has "
+            f"{asked.ndim}, periodic {asked.periodic}; wanted the same axes"
         )
     if is_traced(known, asked):
         return
     boxes = [np.asarray(end, np.float64) for end in (known.lo, known.hi, asked.lo, asked.hi)]
-    slack = 64 * np.finfo(np.float64).eps * (boxes[1] - boxes[0])  # ends that were computed in two ways
+    slack = 64 * np.finfo(np.float64).eps * (boxes[1] - boxes[0])  # the two boxes may be rounded differently
     if np.any(boxes[2] < boxes[0] - slack) or np.any(boxes[3] > boxes[1] + slack):
         raise ValueError(
-            f"{name}: the filter's box from {boxes[2].tolist()} to {boxes[3].tolist()} leaves that of the solution, "
-            f"{boxes[0].tolist()} to {boxes[1].tolist()}, outside which V is not known; solve on a larger one"
+            f"{name}: the filter's box from {boxes[2].tolist()} to {boxes[3].tolist()} leaves the solution's box from "
+            f"{boxes[0].tolist()} to {boxes[1].tolist()}, outside which V is not known; solve on a larger box"
         )
 
 
 def _weighed(probability: Field, exponent: Field) -> tuple[Field, jax.Array]:
-    """Probabilities times e^exponent, normalised, and the logarithm of what their sum was."""
+    """Probabilities times e^exponent, normalised, and the logarithm of their sum before normalising."""
     positive = probability > 0
-    # the largest product is taken out, not the largest factor: where the factor is large, there may be no mass
+    # subtract the largest product, not the largest factor: there may be no mass where the factor is large
     logarithm = jnp.where(positive, jnp.log(jnp.where(positive, probability, 1)) + exponent, -jnp.inf)
     largest = jax.lax.stop_gradient(jnp.max(logarithm))
     weight = jnp.exp(logarithm - largest)
@@ -305,7 +305,7 @@ def _weighed(probability: Field, exponent: Field) -> tuple[Field, jax.Array]:
 
 
 def signal(on: Discretisation, measured: Measurement, name: str) -> Any:
-    """r⁻¹ h at the nodes, shape (p, *grid); refused where it is not finite."""
+    """r⁻¹ h at the nodes, shape (p, *grid); refused if it is not finite."""
     entries = components.components(measured.h, on.coordinates(), dtype=on.dtype)
     h = jnp.stack([jnp.broadcast_to(entry, on.grid.shape) for entry in entries])
     refuse("h(x) is not finite", ~jnp.all(jnp.isfinite(h), axis=0), on.grid, name)
@@ -318,8 +318,8 @@ def _prior(on: Discretisation, given: Callable | Numbers, name: str) -> Any:
     density = on.at_nodes(given) if callable(given) else numbers(given, f"{name}: initial_density")
     if np.shape(density) != on.grid.shape:
         raise ValueError(
-            f"{name}: initial_density has shape {np.shape(density)}, wanted that of the grid, {on.grid.shape}, or a "
-            "function of one state"
+            f"{name}: initial_density has shape {np.shape(density)}, wanted the shape of the grid, {on.grid.shape}, or "
+            "a function of one state"
         )
     if is_traced(density):
         return density / jnp.sum(density * on.grid.volumes())
@@ -327,10 +327,10 @@ def _prior(on: Discretisation, given: Callable | Numbers, name: str) -> Any:
     refuse("initial_density is not a finite number ≥ 0", ~(np.isfinite(density) & (density >= 0)), on.grid, name)
     if not np.any(density):
         raise ValueError(
-            f"{name}: initial_density is zero at every node, so that no record tells anything; put mass on a node: a "
-            "peak narrower than the spacing may fall between two"
+            f"{name}: initial_density is zero at every node, wanted mass on at least one. A peak narrower than the "
+            "spacing may fall between two nodes."
         )
-    density = density / np.max(density)  # before the sum, which might overflow
+    density = density / np.max(density)  # before the sum, which could overflow
     return density / np.sum(density * on.grid.volumes())
 
 
@@ -338,7 +338,7 @@ def _check_rates(on: Discretisation, name: str) -> tuple[int, ...]:
     """Refuse drift or noise that is not finite at a node, and correlated noise that the chain cannot represent.
 
     Returns:
-      The axes whose noise is too small for central differences at some node, under some control.
+      The axes whose noise is too small for central differences, at some node and some control.
     """
     largest = np.zeros(on.grid.ndim)
     for u in sets.probes(on.problem.controls, on.dtype)[:3]:

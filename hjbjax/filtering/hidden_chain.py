@@ -1,14 +1,14 @@
-"""Hidden Markov chains of a few states: their exact filter as an observer, and simulation in closed loop.
+"""Hidden Markov chains with a few states: their exact filter as an observer, and closed-loop simulation.
 
-The chain jumps with the generator A(u), and dy = h(x, u) dt + r dv is seen. W. M. Wonham's filter over a step dt, in
-which control is held and dy is the increment:
+The chain jumps with the generator A(u) and is measured through dy = h(x, u) dt + r dv. W. M. Wonham's filter over a
+step dt, with constant control and the increment dy, is
 
     π ← P½ᵀ π,     π_i ← π_i exp(h_i·R⁻¹dy − ½ h_i·R⁻¹h_i dt) / (sum over i),     π ← P½ᵀ π,
 
-with P½ = exp(A dt/2) and R = r²: Bayes' rule for a chain that jumps at both ends of the step and not within. No entry
-is ever negative and the sum is one for steps of any length; without measurements π is exact. The transition
-matrix is a Taylor series of A + qI ≥ 0, q the fastest rate, over 2^−s of the step, squared s times: sums and products
-of what is not negative.
+where P½ = exp(A dt/2) and R = r². It is Bayes' rule for a chain that jumps only at the two ends of the step. Entries
+are never negative and their sum is one for steps of any length. Without measurements π is exact. The transition matrix
+is a Taylor series of A + qI ≥ 0 over 2^−s of the step, squared s times, with q the fastest rate. Its terms are all
+nonnegative, so nothing cancels.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,11 +25,11 @@ from hjbjax.problem.pytree import as_jax, as_partial, cast, front_door, is_trace
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, Key, Number, Numbers
 
-TERMS = 19  # of the Taylor series: 1/19! is below the rounding of float64 where q dt ≤ 1
+TERMS = 19  # of the Taylor series: 1/19! is below the rounding of float64 if q dt ≤ 1
 
 
 def transition_matrix(rates: Array, dt: Number) -> jax.Array:
-    """exp(A dt) of a generator A, shape (S, S), with entries ≥ 0 and rows that sum to one; pure, for any dt ≥ 0.
+    """exp(A dt) of a generator A, shape (S, S), with entries ≥ 0 and rows that sum to one, for any dt ≥ 0.
 
     Example:
       >>> matrix = transition_matrix(np.array([[-1.0, 1.0], [0.0, 0.0]]), 1.0)
@@ -38,11 +38,11 @@ def transition_matrix(rates: Array, dt: Number) -> jax.Array:
     """
     rates = jnp.asarray(rates)
     fastest = jnp.max(-jnp.diag(rates))
-    # q dt ≤ 1 in each part, where nineteen terms are enough; all of them are ≥ 0, so that nothing cancels
+    # q dt ≤ 1 in each part, so nineteen terms are enough; all terms are ≥ 0, so nothing cancels
     squarings = jnp.ceil(jnp.log2(jnp.maximum(fastest * dt, 1)))
     short = dt / 2**squarings
     one = jnp.eye(rates.shape[0], dtype=rates.dtype)
-    raised = jnp.maximum(rates + fastest * one, 0) * short  # of a diagonal entry zero is left, up to rounding
+    raised = jnp.maximum(rates + fastest * one, 0) * short  # the smallest diagonal entry is zero up to rounding
 
     def add(k, carry):
         total, term = carry
@@ -51,7 +51,7 @@ def transition_matrix(rates: Array, dt: Number) -> jax.Array:
 
     total, _ = jax.lax.fori_loop(1, TERMS, add, (one, one))
 
-    def normal(matrix):  # in place of the factor e^{−q dt}, and so that rounding does not grow with the squarings
+    def normal(matrix):  # replaces the factor e^{−q dt}, and keeps rounding from growing with the squarings
         return matrix / jnp.sum(matrix, axis=1, keepdims=True)
 
     return jax.lax.fori_loop(0, squarings.astype(int), lambda _, matrix: normal(matrix @ matrix), normal(total))
@@ -59,21 +59,21 @@ def transition_matrix(rates: Array, dt: Number) -> jax.Array:
 
 @pytree_dataclass()
 class WonhamFilter:
-    """The belief of a hidden chain as an observer: its state is π, shape (S,).
+    """The belief of a hidden chain as an observer, whose state is π, shape (S,).
 
     The estimate is the conditional mean of the chain's indicator, π itself. A controller is a function of π; with a
     ``belief_problem`` it is ``lambda belief: solution.control_at(coordinates.from_belief(belief), clamp=True)``.
 
     Args:
       generator: A(u), a function of one control that returns shape (S, S), or the matrix itself, per unit time.
-      h: what is seen of each state, shape (S,) or (S, p), or a function of u that returns one of these.
-      prior: π at time 0, shape (S,), ≥ 0, in any multiple.
+      h: the measured quantity in each state, shape (S,) or (S, p), or a function of u that returns one of these.
+      prior: π at time 0, shape (S,), ≥ 0; it need not be normalised.
 
     Keyword Args:
-      measurement_noise: r in dy = h dt + r dv, a number or one a measurement (p,).
+      measurement_noise: r in dy = h dt + r dv, a number or one per measurement (p,).
 
     Raises:
-      ValueError: a prior that is no law, or rates that make no generator.
+      ValueError: a prior that is negative or zero, or rates that are not a generator.
 
     Example:
       >>> observer = WonhamFilter(np.array([[-1.0, 1.0], [1.0, -1.0]]), [1.0, -1.0], [0.5, 0.5])
@@ -105,9 +105,9 @@ class WonhamFilter:
             if law.ndim != 1 or not np.all(np.isfinite(law)) or np.any(law < 0) or not law.sum() > 0:
                 raise ValueError(
                     f"WonhamFilter: prior = {arguments.shown(law.tolist())}; wanted (S,) numbers ≥ 0, not all zero: "
-                    "how likely each state is at time 0"
+                    "the probability of each state at time 0"
                 )
-            law = law / law.sum()  # frequencies serve as well
+            law = law / law.sum()  # frequencies are allowed
         _check_shapes(generator, h, sensor, len(law))
         for name, value in {"generator": fixed, "sensor": sensor, "prior": law}.items():
             object.__setattr__(self, name, value)
@@ -120,13 +120,13 @@ class WonhamFilter:
 
     @front_door
     def update(self, state: Array, u: Control, dy: Array | None, dt: Number) -> jax.Array:
-        """π after holding the control u (m,) for a time dt and seeing the increment dy (p,), or nothing (None)."""
-        check_vector(state, "WonhamFilter.update: the belief", len(self.prior), "one entry a state")
-        check_vector(u, "WonhamFilter.update: u", np.size(u), "what was held over the step, one entry an input")
+        """π after applying the control u (m,) for dt and measuring the increment dy (p,), or None."""
+        check_vector(state, "WonhamFilter.update: the belief", len(self.prior), "one entry per state")
+        check_vector(u, "WonhamFilter.update: u", np.size(u), "the control over the step, one entry per input")
         check_length(dt, "WonhamFilter.update: dt", "the length of the step")
         if dy is not None:
             outputs = jax.eval_shape(self.sensor.values, jnp.asarray(u)).shape[1]
-            check_vector(dy, "WonhamFilter.update: dy", outputs, "the increment over the step, one entry a measurement")
+            check_vector(dy, "WonhamFilter.update: dy", outputs, "the increment over dt, one entry per measurement")
             dy = jnp.asarray(dy)
         return _updated(as_jax(self), jnp.asarray(state), jnp.asarray(u), dy, dt)
 
@@ -136,18 +136,18 @@ class WonhamFilter:
         if dy is None:
             belief = belief @ transition_matrix(jnp.asarray(mine.generator(u), belief.dtype), dt)
             return belief / jnp.sum(belief)
-        # half a step of jumps on either side of the evidence: Strang's splitting, of second order
+        # half a step of jumps before and after the evidence: Strang splitting, order 2
         half = transition_matrix(jnp.asarray(mine.generator(u), belief.dtype), dt / 2)
         gains = mine.sensor(u)
         # dy/r and h/r: unit noise in every measurement
         seen = jnp.asarray(dy, belief.dtype) / mine.sensor.measurement_noise
         evidence = gains @ jnp.broadcast_to(seen, gains.shape[1:]) - jnp.sum(gains**2, axis=1) * dt / 2
         belief = belief @ half
-        # the largest exponent among the states that are possible is 0, so that nothing overflows and not all underflow
+        # the largest exponent among the possible states becomes 0: nothing overflows, and one entry does not underflow
         top = jnp.max(jnp.where(belief > 0, evidence, -jnp.inf))
         belief = belief * jnp.exp(jnp.minimum(evidence - top, 0))
         belief = belief @ half
-        return belief / jnp.sum(belief)  # the factor e^{top} goes with the norm
+        return belief / jnp.sum(belief)  # the factor e^{top} cancels
 
     @front_door
     def estimate(self, state: Array) -> jax.Array:
@@ -160,13 +160,13 @@ _updated = jax.jit(WonhamFilter._after)
 
 @pytree_dataclass()
 class HiddenPath:
-    """A simulated hidden chain with its measurements and beliefs; with several keys one more axis, first, in each.
+    """A simulated hidden chain with its measurements and beliefs; several keys add a leading axis to every array.
 
     Attributes:
       times: shape (k + 1,).
-      hidden: the number of the state at each time, shape (k + 1,), integers.
+      hidden: the index of the state at each time, shape (k + 1,), integers.
       beliefs: π at each time, shape (k + 1, S).
-      controls: what was held over each step, shape (k, m).
+      controls: the control over each step, shape (k, m).
       measurements: the increments dy, shape (k, p).
       cost: ∫ e^{−βt} c dt over the path, shape ().
     """
@@ -180,7 +180,7 @@ class HiddenPath:
 
 
 def _check_shapes(generator: Any, h: Any, sensor: Sensor, states: int) -> None:
-    """Refuse arrays of another number of states than the prior has; of functions nothing is known without a control."""
+    """Refuse arrays whose number of states differs from the prior; functions are checked once a control is known."""
     if not callable(generator) and np.shape(generator) != (states, states):
         raise ValueError(
             f"WonhamFilter: generator has shape {np.shape(generator)}, wanted {(states, states)}: the prior has "
@@ -190,7 +190,7 @@ def _check_shapes(generator: Any, h: Any, sensor: Sensor, states: int) -> None:
         return
     if np.ndim(h) not in (1, 2) or len(np.asarray(h)) != states:
         raise ValueError(
-            f"WonhamFilter: h has shape {np.shape(h)}, wanted ({states},) or ({states}, p): one row a state"
+            f"WonhamFilter: h has shape {np.shape(h)}, wanted ({states},) or ({states}, p): one row per state"
         )
     if not is_traced(h) and not np.all(np.isfinite(np.asarray(h, float))):
         raise ValueError(f"WonhamFilter: h = {arguments.shown(np.asarray(h).tolist())}, wanted finite numbers")
@@ -209,29 +209,29 @@ def simulate_hidden(
     discount: Number = 0.0,
     start: int | None = None,
 ) -> HiddenPath:
-    """Paths of a hidden chain whose control sees the belief alone, in float64; batched over keys.
+    """Paths of a hidden chain under a control that depends only on the belief, in float64; batched over keys.
 
-    The chain at the ends of the steps has its exact law under the control that is held over each; within a step in
-    which it jumps, measurements and costs are those of the mean of its two states, an error of order dt² in the mean.
+    At the ends of the steps the chain has its exact law under the control of each step. In a step with a jump the
+    measurement and the cost are the mean of the two states, an error of order dt² in the mean.
 
     Args:
       observer: the filter, with the generator and the sensor of the chain.
-      control: a function of the belief (S,) that returns u, shape (m,); ``None`` where there is no control, m = 0.
+      control: a function of the belief (S,) that returns u, shape (m,); ``None`` if there is no control, m = 0.
       cost: c, a function of u that returns the cost per unit time in every state, shape (S,).
 
     Keyword Args:
-      duration: how long to run, in units of time; of an endless discounted cost e^{−β duration} is left out.
-      dt: the length of a step, over which the control is held; made a little shorter so that steps fill the duration.
-      key: a JAX random key, an integer, or an array of K keys: then K paths.
+      duration: the length of the simulation, in units of time; it omits e^{−β duration} of an infinite-horizon cost.
+      dt: the length of a step with constant control; shortened slightly so that the steps fill the duration.
+      key: a JAX random key, an integer, or an array of K keys for K paths.
       discount: β ≥ 0, per unit time.
-      start: the hidden state at time 0; ``None``: drawn from the prior.
+      start: the hidden state at time 0. Default: drawn from the prior.
 
     Returns:
       A ``HiddenPath``.
 
     Raises:
-      ValueError: a duration or step that is not positive, a start that is no state, a control, cost, generator or h of
-        the wrong shape or not finite.
+      ValueError: a duration or step that is not positive, a start that is not a state, a control, cost, generator or h
+        with the wrong shape or values that are not finite.
 
     Example:
       >>> observer = WonhamFilter(np.array([[-1.0, 1.0], [1.0, -1.0]]), [1.0, -1.0], [0.5, 0.5])
@@ -251,10 +251,10 @@ def simulate_hidden(
         raise ValueError(
             f"simulate_hidden: start = {arguments.shown(start)}; wanted a state, 0 to {states - 1}, or None"
         )
-    # 1e-9: a duration that is a whole number of steps up to rounding takes no step more
+    # 1e-9: rounding must not add a step to a duration that is a whole number of steps
     steps = int(np.ceil(duration / dt * (1 - 1e-9)))
     keys = arguments.random_key(key, "simulate_hidden: key", batch=True)
-    # float64: over thousands of steps beliefs near a corner would be rounding
+    # float64, because float32 would round away beliefs near a corner over thousands of steps
     with own_settings(x64=True):
         law = np.asarray(observer.prior) if start is None else np.eye(states)[start]
         loop = cast(_Loop(observer, as_partial(control or _nothing), as_partial(cost), float(discount)), np.float64)
@@ -264,7 +264,7 @@ def simulate_hidden(
     for name, found in {"control": path.controls, "h": path.measurements, "cost": path.cost}.items():
         if not np.all(np.isfinite(found)):
             raise ValueError(
-                f"simulate_hidden: {name} returned numbers that are not finite along a path; wanted finite ones for "
+                f"simulate_hidden: {name} returned numbers that are not finite along a path; wanted finite numbers for "
                 "every belief and every control"
             )
     return path
@@ -272,7 +272,7 @@ def simulate_hidden(
 
 @pytree_dataclass()
 class _Loop:
-    """What a simulation is made of."""
+    """The numbers and functions of a simulation."""
 
     observer: WonhamFilter
     control: Any
@@ -281,7 +281,7 @@ class _Loop:
 
 
 def _nothing(belief: Array) -> jax.Array:
-    """No control."""
+    """An empty control."""
     return jnp.zeros(0)
 
 
@@ -311,7 +311,7 @@ def _check_loop(loop: _Loop, states: int) -> None:
 
 
 def _array_of(function: Callable) -> Callable:
-    """The function with its result as an array, whatever kind of number it returns."""
+    """The function with its result converted to an array."""
     return lambda argument: jnp.asarray(function(argument))
 
 
@@ -320,16 +320,16 @@ def _simulated(loop: _Loop, law: jax.Array, key: Key, dt: Any, steps: int) -> Hi
     observer = loop.observer
     key, first = jax.random.split(key)
     hidden, belief = jax.random.choice(first, len(law), p=law), observer.initial()
-    # ∫ e^{−βs} ds over a step; dt without discount
+    # ∫ e^{−βs} ds over a step; equal to dt without a discount
     beta = loop.discount
     length = jnp.where(beta * dt > 0, -jnp.expm1(-beta * dt) / jnp.where(beta > 0, beta, 1), dt)
 
     def step(carry, inputs):
         hidden, belief = carry
         number, key = inputs
-        u = jnp.asarray(loop.control(belief), belief.dtype)  # of the belief alone: the state is hidden from it
+        u = jnp.asarray(loop.control(belief), belief.dtype)  # a function of the belief only: the state is hidden
         jump, shake = jax.random.split(key)
-        # the law of the state at the end of the step, with however many jumps there are between
+        # the law of the state at the end of the step, with any number of jumps in between
         row = transition_matrix(jnp.asarray(observer.generator(u), belief.dtype), dt)[hidden]
         after = jax.random.choice(jump, len(row), p=row)
         gains = observer.sensor(u)

@@ -1,10 +1,10 @@
-"""The stochastic information state: the law of the state given a record of what was measured.
+"""The stochastic information state: the law of the state given a record of measurements.
 
     dq = 𝓛^{u*} q dt + q hᵀ R⁻¹ dy,   q(0) = p₀,   R = r rᵀ                                           (12.6)
 
-is the Duncan–Mortensen–Zakai equation for dx = f(x, u) dt + σ dw, dy = h(x) dt + r dv. Its solution is the unnormalised
-law of the state; q/∫q is the law itself (W. M. Wonham; H. J. Kushner; R. L. Stratonovich), and ∫q the likelihood of the
-record against that of noise alone. ``grid_filter`` makes the steps, here they are made along a record.
+is the Duncan–Mortensen–Zakai equation for dx = f(x, u) dt + σ dw, dy = h(x) dt + r dv. Its solution q is the
+unnormalised law of the state. q/∫q is the law (W. M. Wonham; H. J. Kushner; R. L. Stratonovich), and ∫q is the
+likelihood of the record relative to pure noise. This module runs the steps of ``grid_filter`` along a record.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,14 +26,14 @@ from hjbjax.problem.types import Array, Number, Numbers
 
 @pytree_dataclass()
 class InformationState:
-    """The law of the state after each increment of a record; a batch of records has its axis in front of all.
+    """The law of the state after each increment of a record; a batch of records adds a leading axis to every array.
 
     Args:
-      density: at the nodes, shape (k, *grid), in 1/(units of the states); the initial one is not among them.
+      density: at the nodes, shape (k, *grid), in 1/(units of the states); the initial density is not included.
       mean: shape (k, n), circular along periodic axes.
       covariance: shape (k, n, n).
       mode: shape (k, n), the node at which the density is largest.
-      log_likelihood: shape (k,), log ∫q, of the record so far against that of noise alone.
+      log_likelihood: shape (k,), log ∫q, the log-likelihood of the record so far relative to pure noise.
     """
 
     density: Any
@@ -60,43 +60,43 @@ def zakai(
 
         dq = 𝓛^{u*} q dt + q hᵀ R⁻¹ dy,    q(0) = p₀                                                   (12.6)
 
-    for dx = f(x, u) dt + σ dw and dy = h(x) dt + r dv, R = r rᵀ. Positive, and of mass one up to rounding, whatever dt
-    and the record. Mean and covariance of a linear system are of second order in dt, ``log_likelihood`` of a record
-    with noise of first. In the spacing all are of second order where the law is smooth, by central differences if the
-    noise of an axis makes them monotone, a_ii ≥ h|f_i|, and by a limited flux elsewhere. All k densities are kept; a
-    ``GridFilter`` keeps the last. In float64; under a tracer in the type of the record, with forward derivatives
-    (``jacfwd``); outside ``jit`` and ``vmap`` with reverse ones, too (``grad``).
+    for dx = f(x, u) dt + σ dw and dy = h(x) dt + r dv, R = r rᵀ. The density is ≥ 0 with mass one up to rounding, for
+    any dt and record. The mean and covariance of a linear system have order 2 in dt; the ``log_likelihood`` of a noisy
+    record has order 1. All have order 2 in the spacing where the law is smooth: by central differences if the noise of
+    the axis makes them monotone, a_ii ≥ h|f_i|, and by a limited flux elsewhere. The result holds all k densities; a
+    ``GridFilter`` holds only the last.
 
-    Along a periodic axis the mean is the circular one, the angle of the mean of e^{iθ}, brought into the box, and the
-    covariance that of the differences from it the short way round.
+    Computes in float64. Under a tracer it computes in the type of the record and has forward derivatives (``jacfwd``),
+    and outside ``jit`` and ``vmap`` also reverse derivatives (``grad``).
+    Along a periodic axis the mean is circular, the angle of the mean of e^{iθ} wrapped into the box. The covariance
+    uses differences from this mean, taken the short way round.
 
     Args:
-      problem: the plant: its drift, controls and noise matter.
+      problem: the plant; only its drift, controls and noise are used.
       h: the measured function of one state, returns shape (p,).
-      grid: the nodes, whose box holds the state.
+      grid: the nodes; the box must contain the state.
       dy: the increments of the record, shape (k, p), or (batch, k, p).
-      dt: the time between two of them.
+      dt: the time between two increments.
       initial_density: a function of one state that returns a number ≥ 0, or (*grid); it need not be normalised.
 
     Keyword Args:
-      controls: held over the k steps, shape (k, m), or (batch, k, m); ``None`` without controls.
+      controls: the controls applied over the k steps, shape (k, m) or (batch, k, m); ``None`` without controls.
       measurement_noise: r: a number, (p,) or (p, p), in units of y times time^½.
-      normalised: whether densities have integral one; else q itself, which may overflow over long records.
+      normalised: True for densities with integral one; False for q itself, which may overflow over long records.
 
     Returns:
-      An ``InformationState`` of NumPy arrays, of JAX's under a tracer.
+      An ``InformationState`` of NumPy arrays, or of JAX arrays under a tracer.
 
     Raises:
-      ValueError: a record or controls that are not finite or of the wrong shape, dt ≤ 0, and what ``GridFilter``
-        refuses; a law that is not finite, as where dt asks for more sub-steps than there are.
-      TypeError: as ``GridFilter``.
+      ValueError: a record or controls that are not finite or have the wrong shape; dt ≤ 0; arguments that
+        ``GridFilter`` refuses; a law that is not finite, for example because dt needs too many sub-steps.
+      TypeError: as for ``GridFilter``.
 
-    Warns where the mode lies at an end of the box, where the law is narrower than a cell, and where dt is longer than
-    r/(σ|h'|), the time in which the noise of the state undoes what a measurement shows. The warning names the spacing
-    or the dt that is enough.
+    Warns if the mode is at an end of the box, if the law is narrower than a cell, or if dt is longer than r/(σ|h'|),
+    the time in which the noise of the state undoes a measurement. The warning names a sufficient spacing or dt.
 
     Example:
-      >>> rest = Problem(lambda x, u: 0 * x)  # a constant that is measured, of prior variance 1
+      >>> rest = Problem(lambda x, u: 0 * x)  # a measured constant with prior variance 1
       >>> grid, record = Grid([-8.0], [8.0], (161,)), np.full((10, 1), 0.2)  # dy over ten steps
       >>> law = zakai(rest, lambda x: x, grid, record, 0.1, lambda x: jnp.exp(-x @ x / 2))
       >>> round(float(law.mean[-1, 0]), 9), round(float(law.covariance[-1, 0, 0]), 9)  # y(1) = 2: 2/(1 + 1)
@@ -109,11 +109,11 @@ def zakai(
     check_length(dt, f"{name}: dt", "the time between two increments")
     run = _run if record.ndim == 2 else _run_batch  # one record needs no batch axis, which takes time to compile
     if is_traced(observer, record, acts, dt):
-        # counts are integers without a derivative: under ``grad`` alone they come back as plain numbers, and a loop of
-        # a known length has a reverse derivative; under ``jit`` and ``vmap`` it stays open
+        # integers have no derivative, so under ``grad`` the count is a plain number and the loop has a known length,
+        # which a reverse derivative needs; under ``jit`` and ``vmap`` the count is traced and the loop stays open
         count = _substeps(observer, record, acts, dt)
         return run(as_jax(observer), record, acts, dt, bool(normalised), None if is_traced(count) else int(count))
-    # inside somebody's ``jit`` as well, what is known is computed here and now
+    # inside a caller's ``jit`` too, known numbers are computed at once
     with jax.core.eval_context(), own_settings(x64=True):
         answer = run(*cast((observer, record, acts, dt), np.float64), bool(normalised))
         found = jax.tree.map(np.asarray, answer)
@@ -121,18 +121,18 @@ def zakai(
     if np.any(bad):
         step = int(np.argwhere(bad)[:, -1].min())
         raise ValueError(
-            f"{name}: the law is not finite from step {step} on: dt = {dt:g} asks for over {MOST} sub-steps, or a "
-            "measurement leaves no state a chance; give a shorter dt, a coarser grid, or more measurement_noise"
+            f"{name}: the law is not finite from step {step} on. Either dt = {dt:g} needs more than {MOST} sub-steps, "
+            "or a measurement rules out every state.\nUse a shorter dt, a coarser grid, or a larger measurement_noise."
         )
     warn_at_ends(name, grid, found.mode, float(dt), "the mode of the law")
-    densities = found.density if record.ndim == 2 else found.density[0]  # records of a batch share noise and dt
+    densities = found.density if record.ndim == 2 else found.density[0]  # all records of a batch share noise and dt
     observer.warn_if_coarse(name, densities, float(dt))
     return found
 
 
 @jax.jit
 def _substeps(observer: GridFilter, record: Array, acts: Array, dt: Number) -> jax.Array:
-    """The largest number of sub-steps that a step of a record wants."""
+    """The largest number of sub-steps that any step of a record needs."""
     on, rows = observer._on(record.dtype), jnp.reshape(acts, (record.size // record.shape[-1], acts.shape[-1]))
     return jnp.max(jax.lax.map(lambda u: substeps(on, u, dt, observer.axes), rows))
 
@@ -145,7 +145,7 @@ def _law(
 
     def step(state: Density, row: tuple[Array, Array]) -> tuple[Density, InformationState]:
         state = observer._after(state, row[1], row[0], dt, most)
-        # the filter keeps the norm apart, in its logarithm, or a long record would overflow
+        # the filter keeps the norm as a logarithm, because a long record would overflow
         factor = 1.0 if normalised else jnp.exp(state.log_likelihood)
         shown = InformationState(
             density=state.density * factor,
@@ -157,7 +157,7 @@ def _law(
         return state, shown
 
     first = Density(jnp.asarray(observer.prior, dtype), jnp.zeros((), dtype))
-    # on the way back the sub-steps are made again, so that one density is kept a step
+    # the backward pass repeats the sub-steps, so that only one density per step is stored
     return jax.lax.scan(step if most is None else jax.checkpoint(step), first, (record, acts))[1]
 
 

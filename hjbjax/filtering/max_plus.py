@@ -4,18 +4,18 @@ Between two measurements the worst-case cost p of paths that end in x, for dx/dt
 
     p_t = max_w { −Dp·(f + σw) − ½γ²|w|² } + L = Σ_i max_v { −v D_i p − (γ²/2a_ii) (v − f_i)² } + L,    v = f + σw,
 
-a Hamilton–Jacobi equation without an opponent, convex in Dp. A path arrives at x with velocity v from x − v dt, so that
-v > 0 sees the slope D⁻ from below and v < 0 the slope D⁺ from above: the Godunov flux
+a Hamilton–Jacobi equation without an opponent, convex in Dp. A path arrives at x with velocity v from x − v dt. So
+v > 0 uses the backward slope D⁻ and v < 0 the forward slope D⁺, which gives the Godunov flux
 
-    max{ −v⁺ D⁻ − (γ²/2a) (v⁺ − f)²,  −v⁻ D⁺ − (γ²/2a) (v⁻ − f)² },    v⁺ = (f − aD⁻/γ²)⁺,  v⁻ = (f − aD⁺/γ²)⁻,
+    max{ −v⁺ D⁻ − (γ²/2a) (v⁺ − f)²,  −v⁻ D⁺ − (γ²/2a) (v⁻ − f)² },    v⁺ = (f − aD⁻/γ²)⁺,  v⁻ = (f − aD⁺/γ²)⁻.
 
-which is monotone in all neighbours for steps up to 1/max Σ_i |v_i|/h_i. The velocities are found, never bounded
-beforehand. Without noise on an axis v = f. At an end of an axis nothing flows in: the velocities that come from
-outside are left out; where the drift comes from there and no noise can oppose it, it is cut off.
+It is monotone in all neighbours for steps up to 1/max Σ_i |v_i|/h_i. The velocities are computed from p; no bound is
+needed beforehand. On an axis without noise v = f. Nothing flows in at an end of an axis: velocities that point inwards
+there are set to zero, and so is the drift if no noise can oppose it.
 
-Slopes are those of a scheme, and so is the order in space; in time a strong-stability-preserving Runge–Kutta method
-takes as many steps as the velocities want. All slopes of order 2 and more are exact for a quadratic p, which then stays
-one up to the error in time.
+The scheme of the slopes sets the order in space. In time a strong-stability-preserving Runge–Kutta method makes as many
+steps as the velocities require. Slopes of order 2 and more are exact for a quadratic p, which then stays quadratic up
+to the error in time.
 """
 
 from collections.abc import Sequence
@@ -34,20 +34,20 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Field, Nodes, Number, Scalar
 
 MOST = (
-    100_000  # inner steps: the paths have then crossed as many cells, which no interval of a record is long enough for
+    100_000  # inner steps: a path crosses up to this number of cells, more than any sensible interval of a record needs
 )
-FRACTION = 0.8  # of the limit of a monotone step: velocities of a later stage may be larger than those of the first
+FRACTION = 0.8  # of the monotone step limit, because later stages may have larger velocities than the first
 
 
 @pytree_dataclass()
 class MaxPlusMarch:
-    """The equation of p with everything but p known.
+    """The equation of p, with all terms that do not depend on p.
 
     Args:
-      on: the grid with the slopes of a scheme; of the problem nothing is read.
-      drift: f, n components, each of a shape that broadcasts to (*grid).
-      spread: a_ii/γ² along every axis, ≥ 0.
-      source: L and what a measurement costs, (*grid), per unit time.
+      on: the grid and the scheme of the slopes; its problem is ignored.
+      drift: f, n components, each with a shape that broadcasts to (*grid).
+      spread: a_ii/γ² for every axis, ≥ 0.
+      source: L minus the cost of the measurement, (*grid), per unit time.
     """
 
     on: Discretisation
@@ -71,13 +71,13 @@ class MaxPlusMarch:
         """The Godunov flux along an axis, and |v|/h."""
         f, spread = jnp.asarray(self.drift[axis]), jnp.asarray(self.spread[axis])
         noisy = spread > 0
-        room = jnp.where(noisy, spread, 1)  # a division by zero would make NaN of the branch that is not taken
+        room = jnp.where(noisy, spread, 1)  # dividing by zero in the unused branch would make NaN derivatives
         lower, upper = (stencil.wall(self.on.grid, axis, step) for step in (-1, 1))
         rising = jnp.where(lower, 0, jnp.maximum(f - spread * down, 0))
         falling = jnp.where(upper, 0, jnp.minimum(f - spread * up, 0))
         from_below = -rising * down - jnp.where(noisy, (rising - f) ** 2 / (2 * room), 0)
         from_above = -falling * up - jnp.where(noisy, (falling - f) ** 2 / (2 * room), 0)
-        # without noise the velocity is the drift, and one of the two is zero: their sum is the upwind difference
+        # without noise the velocity is the drift and one of the two terms is zero, so the sum is the upwind difference
         gain = jnp.where(noisy, jnp.maximum(from_below, from_above), from_below + from_above)
         return gain, jnp.maximum(rising / link.down, -falling / link.up)
 
@@ -95,29 +95,29 @@ class MaxPlusMarch:
         return total
 
     def after(self, p: Field, dt: Number, most: int | None = None) -> tuple[Field, jax.Array]:
-        """p a time dt later, by as many steps as the velocities want, and their number.
+        """p after the time dt, in as many steps as the velocities require, and the number of steps.
 
-        NaN where p is no longer finite, and where more than ``MOST`` steps are wanted. With ``most`` the loop makes so
-        many steps, of no length once the time is used up: it has then a derivative in reverse mode, too.
+        NaN if p is no longer finite or if more than ``MOST`` steps are needed. With ``most`` the loop makes exactly
+        that number of steps, of length zero once the time is used up, and has a reverse derivative.
         """
         tableau = TABLEAUX[self.on.scheme.stages]
-        # a measurement with little noise bends p so much within a step that its velocities at the start say nothing
-        least = jnp.sqrt(jax.lax.stop_gradient(self.growth()))  # the root of zero has no derivative
+        # an accurate measurement bends p so fast that the velocities at the start of the step underestimate later ones
+        least = jnp.sqrt(jax.lax.stop_gradient(self.growth()))  # the root has no derivative at zero
         means = jnp.asarray(tableau.means, p.dtype)
 
         def step(carry):
             p, left, count = carry
             first, speed = self.rate(p)
             whole = jnp.ceil(left * jnp.maximum(speed / FRACTION, least))
-            dt = left / jnp.maximum(whole, 1)  # equal steps, were the velocities to stay as they are
+            dt = left / jnp.maximum(whole, 1)  # the steps are equal if the velocities do not change
             moved = p + dt * first  # the first mean is zero in every tableau
 
             def stage(k, w):
                 return means[k] * p + (1 - means[k]) * (w + dt * self.rate(w)[0])
 
-            # a loop, so that the slopes are compiled once and not once a stage
+            # a loop compiles the slopes once instead of once per stage
             moved = jax.lax.fori_loop(1, len(tableau.means), stage, moved)
-            # an infinite velocity would take steps of no length for ever
+            # an infinite velocity would otherwise take infinitely many steps of length zero
             fine = jnp.isfinite(speed) & jnp.all(jnp.isfinite(moved)) & (count < MOST)
             rest = jnp.where(whole <= 1, 0, left - dt)
             return jnp.where(fine, moved, jnp.nan), jnp.where(fine, rest, 0), count + (left > 0)
@@ -125,7 +125,7 @@ class MaxPlusMarch:
         carry = p, jnp.asarray(dt, p.dtype), jnp.zeros((), jnp.int32)
         if most is None:
             p, _, count = jax.lax.while_loop(lambda carry: carry[1] > 0, step, carry)
-        else:  # the steps are made again on the way back, so that one p is kept a step
+        else:  # the backward pass repeats the steps, so that only one p per step is stored
             again = jax.checkpoint(step)
             (p, _, count), _ = jax.lax.scan(lambda carry, _: (again(carry), None), carry, length=most)
         return p, count
@@ -135,23 +135,23 @@ class MaxPlusMarch:
 def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]:
     """The maximum of p + ψ over the box and the state where it is attained: the max-plus inner product (p, ψ).
 
-    Between the nodes p + ψ is taken as the quadratic through the largest node and its neighbours, cross terms
-    included: third order where p + ψ is smooth, exact for a concave quadratic whose maximum lies within the box.
-    The state is never more than a spacing from the largest node, and a maximum at an end stays there.
+    Between the nodes p + ψ is approximated by the quadratic through the largest node and its neighbours, with cross
+    terms. The order is 3 where p + ψ is smooth, and the result is exact for a concave quadratic with its maximum inside
+    the box. The state is at most one spacing from the largest node. A maximum at an end of the box is not refined.
 
     Args:
-      p: the information state at the nodes, shape (*grid); −∞ for states that are impossible.
-      psi: a cost at the nodes, shape (*grid), or a number; with the value function of the control problem the state is
-        the one that certainty equivalence for games acts on.
+      p: the information state at the nodes, shape (*grid); −∞ for impossible states.
+      psi: a cost at the nodes, shape (*grid), or a number. If it is the value function of the control problem, the
+        maximiser is the state used by certainty equivalence for games.
       grid: the nodes.
 
     Returns:
-      The maximum, shape (), in the units of cost, and the state, shape (n,), NaN where p + ψ is −∞ at all nodes. Jit-
-      and vmap-able.
+      The maximum, shape (), in the units of cost, and the state, shape (n,), NaN if p + ψ is −∞ at all nodes. Both
+      support ``jit`` and ``vmap``.
 
     Raises:
       ValueError: node values of another shape than the grid, or NaN.
-      TypeError: no Grid, values that are no numbers.
+      TypeError: an argument that is not a Grid, or values that are not numbers.
 
     Example:
       >>> grid = Grid([-1.0], [1.0], (11,))
@@ -173,7 +173,7 @@ def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]
                 f"sup_pairing: {name} is NaN at {int(np.sum(np.isnan(values)))} nodes, wanted numbers or −∞"
             )
         if shape != grid.shape and not (name == "psi" and shape == ()):
-            raise ValueError(f"sup_pairing: {name} has shape {shape}, wanted {grid.shape}: one number a node")
+            raise ValueError(f"sup_pairing: {name} has shape {shape}, wanted {grid.shape}: one number per node")
     total = given["p"] + given["psi"]
     if is_traced(total, grid):
         return refined_maximum(jnp.asarray(total), grid)
@@ -183,7 +183,7 @@ def sup_pairing(p: Nodes, psi: Nodes | float, grid: Grid) -> tuple[Array, Array]
 
 
 def refined_maximum(values: Field, grid: Grid) -> tuple[Scalar, jax.Array]:
-    """The maximum of node values and its place, between the nodes by the quadratic around the largest one; traceable.
+    """The maximum of node values and its state, refined by a quadratic around the largest node; traceable.
 
     Returns:
       The maximum, shape (), and the state, shape (n,), inside the box and wrapped on periodic axes.
@@ -210,7 +210,7 @@ def refined_maximum(values: Field, grid: Grid) -> tuple[Scalar, jax.Array]:
         for j in range(i):
             cross = sum(p * q * unit((i, p), (j, q)) for p in (-1, 1) for q in (-1, 1))
             hessian[i][j] = hessian[j][i] = cross / (sum(around[i][1]) * sum(around[j][1]))
-    widths = jnp.stack([jnp.stack(each[1]) for each in around])  # (n, 2): to the node below and to the one above
+    widths = jnp.stack([jnp.stack(each[1]) for each in around])  # (n, 2): to the node below and to the node above
     free = jnp.stack([each[2] for each in around]) & jnp.isfinite(jnp.stack(gradient))
     shift = _climb(jnp.stack(gradient), jnp.stack([jnp.stack(row) for row in hessian]), free, widths)
     slope, bend = jnp.where(free, jnp.stack(gradient), 0), jnp.stack([jnp.stack(row) for row in hessian])
@@ -218,7 +218,7 @@ def refined_maximum(values: Field, grid: Grid) -> tuple[Scalar, jax.Array]:
     gain = slope @ shift + shift @ bend @ shift / 2
     place = jnp.stack([jnp.asarray(grid.axis(axis), dtype)[best[axis]] for axis in range(n)])
     better = gain > 0
-    # NaN is the largest to argmax: where p is none, or −∞ everywhere, no state is the worst
+    # argmax treats NaN as the largest value: if p is NaN somewhere, or −∞ everywhere, the state is NaN
     found = jnp.where(jnp.isnan(top) | (top == -jnp.inf), jnp.nan, place + jnp.where(better, shift, 0))
     return top + jnp.where(better, gain, 0), grid.wrap(found)
 
@@ -227,7 +227,7 @@ _refined_maximum = jax.jit(refined_maximum)
 
 
 def _neighbours(grid: Grid, best: Sequence[jax.Array], dtype: Any) -> list[tuple[list, list, Any]]:
-    """For every axis: numbers of the node below, the node and the one above; two distances; whether both are there."""
+    """For every axis: the indices of the node below, the node and the node above; two distances; True if both exist."""
     found = []
     for axis, count in enumerate(grid.shape):
         here, x = best[axis], jnp.asarray(grid.axis(axis), dtype)
@@ -238,24 +238,24 @@ def _neighbours(grid: Grid, best: Sequence[jax.Array], dtype: Any) -> list[tuple
             continue
         inside = (here > 0) & (here < count - 1)
         numbers = [jnp.clip(here + step, 0, count - 1) for step in (-1, 0, 1)]
-        # a node at an end is its own neighbour: any width but zero will do, as that axis is left out
+        # a node at an end is its own neighbour; any width but zero works, because that axis is left out
         down, up = (jnp.where(inside, x[numbers[k + 1]] - x[numbers[k]], 1) for k in (0, 1))
         found.append((numbers, [down, up], inside))
     return found
 
 
 def _climb(gradient: jax.Array, hessian: jax.Array, free: jax.Array, widths: jax.Array) -> jax.Array:
-    """The step to the maximum of the quadratic, at most to the neighbours; axis by axis where the whole has none."""
+    """The step to the maximum of the quadratic, clipped to the neighbours; axis by axis if the quadratic has none."""
     n = gradient.shape[0]
-    # in units of the spacings, so that a determinant compares like with like
+    # in units of the spacings, so that all entries are comparable
     scale = jnp.mean(widths, axis=1)
     slope = jnp.where(free, gradient * scale, 0)
     bend = hessian * scale[:, None] * scale[None, :]
     curved = free & (jnp.diag(bend) < 0)
     kept = curved[:, None] & curved[None, :] & jnp.isfinite(bend)
-    bend = jnp.where(kept, bend, -jnp.eye(n, dtype=bend.dtype))  # axes without a bend go nowhere
+    bend = jnp.where(kept, bend, -jnp.eye(n, dtype=bend.dtype))  # no step along axes without negative curvature
     slope = jnp.where(curved, slope, 0)
-    # a degenerate quadratic is one whose determinant, over that of its diagonal, is rounding
+    # the quadratic is degenerate if an eigenvalue, after scaling the diagonal to one, is of the size of rounding
     unit = bend / jnp.sqrt(jnp.outer(jnp.diag(bend), jnp.diag(bend)))
     whole = -jnp.linalg.solve(jnp.where(jnp.all(jnp.isfinite(unit)), bend, -jnp.eye(n, dtype=bend.dtype)), slope)
     definite = jnp.all(jnp.linalg.eigvalsh(unit) < -jnp.sqrt(jnp.finfo(bend.dtype).eps))

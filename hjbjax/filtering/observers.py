@@ -1,28 +1,27 @@
-"""Observers: from what is measured to an estimate of the state, in steps of one length.
+"""Observers: estimates of the state from measurements, step by step.
 
     dx = f(x, u) dt + σ dw,    dy = h(x) dt + r dv
 
-An observer holds an information state, any pytree of arrays. It sees the control that was held over a step and the
-increment dy of the record, and nothing else. Steps may differ in length. ``update`` with ``dy=None`` predicts, and
-``correct`` takes a sample y = h(x) + s v at one time, so a sensor that is sampled at irregular times t_k is
+An observer has an information state, any pytree of arrays. It receives only the control over a step and the increment
+dy of the record. Steps may differ in length. ``update`` with ``dy=None`` predicts. ``correct`` processes a sample
+y = h(x) + s v at one time, so a sensor that is sampled at irregular times t_k is
 
     state = observer.update(state, u, None, t_k − t_{k−1})
     state = observer.correct(state, y_k, measurement_noise=s)
 
-Steps on which the drift is affine are made exactly, whatever their
-length: with dξ = (F ξ + g) dt + dw, W dt the covariance of dw, so are
+A step with affine drift is exact for any length. For dξ = (F ξ + g) dt + dw with W dt the covariance of dw, the step is
 
-    Φ = e^{F t},    s = ∫₀ᵗ e^{F σ} g dσ,    Q = ∫₀ᵗ e^{F σ} W e^{Fᵀ σ} dσ
+    Φ = e^{F t},    s = ∫₀ᵗ e^{F σ} g dσ,    Q = ∫₀ᵗ e^{F σ} W e^{Fᵀ σ} dσ.
 
-by Taylor series on a short piece and doublings,
+These are Taylor series on a short piece, followed by doublings,
 
-    s(2t) = s + Φ s,    Q(2t) = Q + Φ Q Φᵀ,    Φ(2t) = Φ²,
+    s(2t) = s + Φ s,    Q(2t) = Q + Φ Q Φᵀ,    Φ(2t) = Φ².
 
-which add covariances and subtract nothing, so that no step is too long, unlike with C. F. Van Loan's exponential of
-[−F, W; 0, Fᵀ], whose e^{−F t} overflows for a stiff system.
+They only add covariances, so no step is too long. C. F. Van Loan's exponential of [−F, W; 0, Fᵀ] instead contains
+e^{−F t}, which overflows for a stiff system.
 
-An observer of your own is an object with three methods, see ``output_loop.Observer``; make it a pytree
-(``pytree_dataclass``), and other numbers in it compile nothing anew.
+A custom observer is an object with three methods, see ``output_loop.Observer``. Make it a pytree
+(``pytree_dataclass``), so that changing its numbers does not recompile.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,10 +40,10 @@ from hjbjax.problem.types import Array, Control, Number, Numbers, State
 
 __all__ = ["ExtendedKalman", "Gaussian", "Luenberger", "Observer", "affine_flow"]
 
-SHORT = 0.25  # of the piece, |F| t: the series of Q then falls like ½^j/j!
-TERMS = 14  # of the series: what is left is ½^15/15!, 2e-17
-DOUBLINGS = 64  # at most: a piece 2^64 times shorter than the step is no longer told from none
-ROUNDINGS = 64  # units of eps: what rounding may leave of symmetry and of a zero eigenvalue in a covariance
+SHORT = 0.25  # |F| t of the short piece: the terms of the series of Q then fall like ½^j/j!
+TERMS = 14  # of the series: the remainder is ½^15/15!, 2e-17
+DOUBLINGS = 64  # at most: a piece 2^64 times shorter than the step is below rounding
+ROUNDINGS = 64  # units of eps: the rounding error allowed in the symmetry and the zero eigenvalues of a covariance
 
 
 @pytree_dataclass()
@@ -62,31 +61,31 @@ class Gaussian:
 
 @pytree_dataclass()
 class ExtendedKalman:
-    """The extended Kalman–Bucy filter: the law of the state, taken for normal.
+    """The extended Kalman–Bucy filter: the law of the state, approximated by a normal law.
 
         dx̂ = f(x̂, u) dt + K (dy − h(x̂) dt),    Ṗ = A P + P Aᵀ + σσᵀ − K R Kᵀ,    K = P Cᵀ R⁻¹,  R = r rᵀ
 
-    with A = ∂f/∂x and C = ∂h/∂x at the estimate. In each step f and h are linear about the estimate at its start; the
-    law of the state and of dy at its end is then normal with moments that are known exactly, and P is conditioned on
-    dy by a congruence, P⁺ = [I, −K] S [I, −K]ᵀ: symmetric, without a negative eigenvalue, whatever dt. Sensors that
-    rounding cannot tell apart count by their mean. For a linear
-    plant the result is the exact law given the increments, which is Kalman and Bucy's up to O(dt²).
+    with A = ∂f/∂x and C = ∂h/∂x at the estimate. Each step linearises f and h about the estimate at its start. The law
+    of the state and of dy at its end is then normal with known moments. P is conditioned on dy by the congruence
+    P⁺ = [I, −K] S [I, −K]ᵀ, so it is symmetric without negative eigenvalues for any dt. Sensors that agree up to
+    rounding are averaged. For a linear plant the result is the exact law given the increments, which agrees with the
+    Kalman–Bucy filter up to O(dt²).
 
-    Noise that depends on the state counts with its value at the estimate. Angles are not wrapped: measure their sine
-    and cosine.
+    Noise that depends on the state is evaluated at the estimate. Angles are not wrapped: measure their sine and cosine.
 
     Args:
-      problem: the plant: its drift, controls and noise matter.
+      problem: the plant; only its drift, controls and noise are used.
       h: the measured function of one state, returns shape (p,).
-      mean: of the state at t = 0, shape (n,).
-      covariance: at t = 0, shape (n, n), or (n,) of independent entries.
+      mean: the mean at t = 0, shape (n,).
+      covariance: the covariance at t = 0, shape (n, n), or (n,) for independent entries.
 
     Keyword Args:
       measurement_noise: r in dy = h(x) dt + r dv: a number, (p,) or (p, p).
 
     Raises:
-      ValueError: a game, a problem that depends on time, a covariance that is none, an h or a noise of the wrong shape.
-      TypeError: no Problem, an h that cannot be called, entries that are no numbers.
+      ValueError: a game, a problem that depends on time, a matrix that is not a covariance, an h or a noise of the
+        wrong shape.
+      TypeError: an argument that is not a Problem, an h that cannot be called, entries that are not numbers.
 
     Example:
       >>> filter = ExtendedKalman(Problem(lambda x, u: -x, noise=1.0), lambda x: x, [0.0], [0.5], measurement_noise=0.1)
@@ -122,7 +121,7 @@ class ExtendedKalman:
             "covariance": _covariance(covariance, n, f"{name}: covariance"),
         }
         for field, value in fields.items():
-            object.__setattr__(self, field, value)  # frozen, as what is compiled for it knows it
+            object.__setattr__(self, field, value)  # frozen, because compiled programs depend on the fields
 
     @front_door
     def initial(self) -> Gaussian:
@@ -132,9 +131,9 @@ class ExtendedKalman:
 
     @front_door
     def update(self, state: Gaussian, u: Control, dy: Array | None, dt: Number) -> Gaussian:
-        """The law after holding the control u (m,) for dt and seeing the increment dy (p,), or nothing (None)."""
+        """The law after applying the control u (m,) for dt and measuring the increment dy (p,), or None."""
         mean, p = state.mean, self.measurement.dim
-        check_vector(mean, "ExtendedKalman.update: the mean", len(self.mean), "one entry a state")
+        check_vector(mean, "ExtendedKalman.update: the mean", len(self.mean), "one entry per state")
         check_step("ExtendedKalman.update", self.plant, p, (u, dy, dt))
         n, dtype = mean.shape[0], mean.dtype
         u, dt = jnp.asarray(u, dtype), jnp.asarray(dt, dtype)
@@ -145,7 +144,7 @@ class ExtendedKalman:
 
         sigma = self.plant.diffusion(mean, u).astype(dtype)
         noise = jnp.eye(n + p, dtype=dtype).at[:n, :n].set(sigma @ sigma.T)
-        # the slopes in y are zero: what was measured does not come back into the plant
+        # the slopes in y are zero: the measurement does not act on the plant
         slopes = jnp.pad(jax.jacfwd(rates)(mean), ((0, 0), (0, p)))
         transition, shift, spread = affine_flow(slopes, rates(mean), noise, dt, states=n)
         predicted, flow = mean + shift[:n], transition[:, :n]
@@ -153,7 +152,7 @@ class ExtendedKalman:
             covariance = flow[:n] @ state.covariance @ flow[:n].T + spread[:n, :n]
             return Gaussian(predicted, (covariance + covariance.T) / 2)
         innovation = self.measurement.whitened(jnp.asarray(dy, dtype)) - shift[n:]
-        # in units of its noise dy has a covariance of dt and more
+        # in units of its noise the covariance of dy is at least dt
         return _conditioned(Gaussian(predicted, state.covariance), innovation, flow, spread, dt)
 
     @front_door
@@ -177,7 +176,7 @@ class ExtendedKalman:
           (0.5, 0.5)
         """
         name, mean = "ExtendedKalman.correct", state.mean
-        check_vector(mean, f"{name}: the mean", len(self.mean), "one entry a state")
+        check_vector(mean, f"{name}: the mean", len(self.mean), "one entry per state")
         sampled = sample_of(self.measurement, y, measurement_noise, name)
         n, p, dtype = mean.shape[0], sampled.dim, mean.dtype
 
@@ -197,23 +196,22 @@ class ExtendedKalman:
 
 @pytree_dataclass()
 class Luenberger:
-    """The Luenberger observer, a copy of the plant that what is measured pulls along.
+    """The Luenberger observer, a copy of the plant corrected by the measurement error.
 
         dx̂/dt = f(x̂, u) + G(x̂) (y − h(x̂))                                                     (12.3)
 
-    with y = dy/dt constant over a step. One exponential step of Euler's (Rosenbrock's form): exact where the right-hand
-    side is affine, of the second order elsewhere, stable whatever the gain and dt where the error equation is.
+    with y = dy/dt constant over a step. One exponential Euler step in Rosenbrock's form: exact if the right-hand side
+    is affine, otherwise of order 2, and stable for any gain and dt for which the error equation is stable.
 
     Args:
-      problem: the plant: its drift matters.
+      problem: the plant; only its drift is used.
       h: the measured function of one state, returns shape (p,).
-      gain: G, shape (n, p), per unit time and in units of x over those of y, or a function of the estimate that
-        returns it.
+      gain: G, shape (n, p), per unit time, in units of x per unit of y, or a function of the estimate that returns
+        this matrix.
       start: x̂ at t = 0, shape (n,).
-
     Raises:
       ValueError: a game, a problem that depends on time, an h or a gain of the wrong shape.
-      TypeError: no Problem, an h that cannot be called, entries that are no numbers.
+      TypeError: an argument that is not a Problem, an h that cannot be called, entries that are not numbers.
 
     Example:
       >>> observer = Luenberger(Problem(lambda x, u: -x), lambda x: x, [[3.0]], [0.0])
@@ -250,8 +248,8 @@ class Luenberger:
 
     @front_door
     def update(self, state: State, u: Control, dy: Array | None, dt: Number) -> State:
-        """x̂ after holding the control u (m,) for dt and seeing the increment dy (p,), or nothing (None)."""
-        check_vector(state, "Luenberger.update: the estimate", len(self.start), "one entry a state")
+        """x̂ after applying the control u (m,) for dt and measuring the increment dy (p,), or None."""
+        check_vector(state, "Luenberger.update: the estimate", len(self.start), "one entry per state")
         check_step("Luenberger.update", self.plant, self.measurement.dim, (u, dy, dt))
         n, dtype = state.shape[0], state.dtype
         dt = jnp.asarray(dt, dtype)
@@ -274,24 +272,24 @@ class Luenberger:
 
 
 def _conditioned(law: Gaussian, innovation: Array, flow: Array, spread: Array, least: Array) -> Gaussian:
-    """The law of the state given what was measured.
+    """The law of the state given the measurement.
 
     Args:
       law: the predicted mean, shape (n,), and the covariance P before the step, shape (n, n).
-      innovation: the measurement less its mean, in units of its noise, shape (p,).
-      flow: the rows of the state and of the measurement, shape (n + p, n): their covariance is flow P flowᵀ + spread.
-      spread: the covariance of what is added, shape (n + p, n + p).
-      least: the variance of the measurement noise alone.
+      innovation: the measurement minus its mean, in units of its noise, shape (p,).
+      flow: the rows of the state and of the measurement, shape (n + p, n). Their covariance is flow P flowᵀ + spread.
+      spread: the covariance of the added noise, shape (n + p, n + p).
+      least: the variance of the measurement noise.
     """
     n = len(law.mean)
     joint = flow @ law.covariance @ flow.T + spread
     sizes = jnp.sqrt(jnp.maximum(jnp.diagonal(joint)[n:], least))
     p = len(sizes)
     correlation = joint[n:, n:] / jnp.outer(sizes, sizes)
-    if p > 1:  # of sensors that agree up to rounding the correlation has no inverse, and their difference says nothing
+    if p > 1:  # the correlation of sensors that agree up to rounding is singular; regularising it averages them
         correlation = correlation + ROUNDINGS * p * jnp.finfo(joint.dtype).eps * jnp.eye(p, dtype=joint.dtype)
     gain = jnp.linalg.solve(correlation, joint[n:, :n] / sizes[:, None]).T / sizes
-    # two congruences, neither of which cancels below zero as the one of their sum does for nearly exact sensors
+    # a sum of two congruences; the usual difference of covariances can become negative for nearly exact sensors
     keep = jnp.concatenate([jnp.eye(n, dtype=joint.dtype), -gain], axis=1)
     carried = keep @ flow
     covariance = carried @ law.covariance @ carried.T + keep @ spread @ keep.T
@@ -299,25 +297,25 @@ def _conditioned(law: Gaussian, innovation: Array, flow: Array, spread: Array, l
 
 
 def affine_flow(matrix: Array, source: Array, noise: Array, dt: Number, *, states: int) -> tuple[Array, Array, Array]:
-    """Φ, s and Q after the time dt, shapes (k, k), (k,) and (k, k).
+    """Φ, s and Q after the time dt, shapes (k, k), (k,) and (k, k), see the top of the module.
 
     Args:
-      matrix: F, shape (k, k); of its columns only the first ``states`` need not be zero.
+      matrix: F, shape (k, k); only its first ``states`` columns may be nonzero.
       source: g, shape (k,).
-      noise: W, shape (k, k), symmetric and not negative.
+      noise: W, shape (k, k), symmetric and nonnegative.
       dt: the length of the step, in units of time.
-      states: the number of entries that feed back. The others are integrals of them, whose units do not count for
-        the number of doublings, and cost no rounding.
+      states: the number of entries that feed back. The others are integrals of these entries, so their units do not
+        affect the number of doublings or the rounding.
     """
     inner = jnp.abs(matrix[:states, :states])
-    # both bound the spectral radius; the lesser one, as states may have units far apart
+    # both norms bound the spectral radius; take the smaller, as the units of the states may differ widely
     rate = jnp.minimum(jnp.max(jnp.sum(inner, axis=0)), jnp.max(jnp.sum(inner, axis=1)))
     halvings = jnp.ceil(jnp.log2(jnp.maximum(rate * dt / SHORT, 1)))
     halvings = jnp.where(jnp.isfinite(halvings), jnp.clip(halvings, 0, DOUBLINGS), 0)
     piece = dt * jnp.exp2(-halvings)
 
     def add(j: int, carry: tuple) -> tuple:
-        # t^j F^j/j!, t^{j+1} F^j g/(j+1)! and the same of Q: T_{j+1} = F T_j + T_j Fᵀ
+        # t^j F^j/j!, t^{j+1} F^j g/(j+1)!, and the terms of Q with the recursion T_{j+1} = F T_j + T_j Fᵀ
         sums, (power, push, spread) = carry[:3], carry[3]
         half = matrix @ spread
         power, push, spread = (
@@ -343,7 +341,7 @@ def _start(given: Numbers | Sequence[float], name: str) -> Any:
     """A state, shape (n,), of finite numbers."""
     state = numbers(given, name)
     if np.ndim(state) != 1 or np.size(state) == 0 or (not is_traced(state) and not np.all(np.isfinite(state))):
-        raise ValueError(f"{name} is {given!r}, wanted finite numbers of shape (n,), one a state")
+        raise ValueError(f"{name} is {given!r}, wanted finite numbers of shape (n,), one per state")
     return state
 
 
@@ -351,14 +349,14 @@ def _covariance(given: Numbers | Sequence, n: int, name: str) -> Any:
     """A covariance, shape (n, n), symmetric and without negative eigenvalues."""
     matrix = numbers(given, name)
     if np.shape(matrix) not in ((n,), (n, n)):
-        raise ValueError(f"{name} has shape {np.shape(matrix)}, wanted ({n}, {n}), or ({n},) of independent entries")
+        raise ValueError(f"{name} has shape {np.shape(matrix)}, wanted ({n}, {n}), or ({n},) for independent entries")
     if is_traced(matrix):
         return jnp.diag(matrix) if matrix.ndim == 1 else matrix
     matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
     variances = np.diag(matrix)
     slack = ROUNDINGS * n * np.finfo(np.float64).eps
     ok = bool(np.all(np.isfinite(matrix)) and np.all(variances >= 0))
-    if ok:  # as correlations, which have no units; an entry that is known exactly is correlated with none
+    if ok:  # check correlations, which have no units; an entry with variance zero must have no correlations
         scale = np.sqrt(np.where(variances > 0, variances, 1))
         correlation = matrix / np.outer(scale, scale)
         ok = bool(np.all(np.abs(correlation - correlation.T) <= slack) and np.linalg.eigvalsh(correlation)[0] >= -slack)
@@ -370,7 +368,7 @@ def _covariance(given: Numbers | Sequence, n: int, name: str) -> Any:
 
 
 def _gain(given: Callable | Numbers | Sequence, wanted: tuple[int, int], name: str) -> Any:
-    """G as a matrix or as a function of the estimate that returns one."""
+    """G as a matrix or as a function of the estimate that returns a matrix."""
     if callable(given):
         function: Any = as_partial(given, f"{name}: gain")
         with own_settings(x64=True):
@@ -381,5 +379,5 @@ def _gain(given: Callable | Numbers | Sequence, wanted: tuple[int, int], name: s
         if not is_traced(function) and not np.all(np.isfinite(function)):
             raise ValueError(f"{name}: gain is {given!r}, wanted finite numbers")
     if shape != wanted:
-        raise ValueError(f"{name}: gain has shape {shape}, wanted (n, p) = {wanted}: one column a measured quantity")
+        raise ValueError(f"{name}: gain has shape {shape}, wanted (n, p) = {wanted}: one column per measured quantity")
     return function

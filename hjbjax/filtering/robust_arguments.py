@@ -1,4 +1,4 @@
-"""What the robust filter is given, checked before anything is compiled."""
+"""Checks of the robust filter's arguments, made before anything is compiled."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from hjbjax.tracing import checks, components
 
 
 def check_question(problem: object, grid: object, scheme: Any) -> None:
-    """Refuse what has no robust information state on a grid."""
+    """Refuse a problem without a robust information state on the grid."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(
             f"robust_filter: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid"
@@ -23,14 +23,14 @@ def check_question(problem: object, grid: object, scheme: Any) -> None:
     if problem.is_game or problem.time_dependent:
         what = "an opponent" if problem.is_game else "functions that depend on time"
         raise ValueError(
-            f"robust_filter: got a problem with {what}, wanted drift (x, u) and cost (x, u): the disturbance of the "
-            "filter is w, which pays ½γ²|w|²; leave the other out"
+            f"robust_filter: got a problem with {what}, wanted drift (x, u) and cost (x, u). The disturbance of the "
+            "filter is w, which pays ½γ²|w|²; remove the other one."
         )
     grid.refuse_prescribed("robust_filter", "which prescribe V and not the information state p")
     if grid.sides("open"):
         raise ValueError(
-            "robust_filter: got a grid with open ends, through which p would flow in from where nothing is known; "
-            "choose edges='projected' or 'constrained'"
+            "robust_filter: got a grid with open ends, through which unknown values of p would flow in; choose "
+            "edges='projected' or 'constrained'"
         )
     schemes.check(scheme, "robust_filter: scheme", grid)
     checks.of_one_state(
@@ -44,7 +44,7 @@ def check_question(problem: object, grid: object, scheme: Any) -> None:
 
 
 def initial_values(initial: Any, grid: Grid) -> Any:
-    """p₀ at the nodes, refused where it is not finite."""
+    """p₀ at the nodes; refused if it is not finite."""
     values: Any
     if callable(initial):
         with own_settings(x64=True):
@@ -55,12 +55,12 @@ def initial_values(initial: Any, grid: Grid) -> Any:
     else:
         values = numbers(initial, "robust_filter: initial")
     if np.shape(values) != grid.shape:
-        raise ValueError(f"robust_filter: initial has shape {np.shape(values)}, wanted {grid.shape}: one number a node")
+        raise ValueError(f"robust_filter: initial has shape {np.shape(values)}, wanted {grid.shape}: one per node")
     if not is_traced(values) and not np.all(np.isfinite(values)):
         bad = np.asarray(values)[~np.isfinite(values)][0]
         raise ValueError(
-            f"robust_filter: initial is {bad} at some node, wanted finite numbers: slopes are made of differences; for "
-            "a state known to lie in a set take a steep −γ² dist²/(2Y) outside, with √Y a few spacings"
+            f"robust_filter: initial is {bad} at some node, wanted finite numbers, because slopes are differences.\n"
+            "For a state known to be in a set use a steep −γ² dist²/(2Y) outside it, with √Y a few spacings."
         )
     return values
 
@@ -70,7 +70,7 @@ def gains(problem: Problem, sigma: Any, n: int) -> Any:
     given = problem.noise if sigma is None else sigma
     if callable(given):
         raise ValueError(
-            "robust_filter: got a noise that is a function of the state, wanted numbers; give sigma=, a number, (n,) "
+            "robust_filter: got a noise that is a function of the state, wanted numbers; pass sigma=, a number, (n,) "
             "or (n, k)"
         )
     array: Any = numbers(1.0 if given is None else given, "robust_filter: sigma")
@@ -78,7 +78,7 @@ def gains(problem: Problem, sigma: Any, n: int) -> Any:
         raise ValueError(f"robust_filter: sigma has shape {array.shape}, wanted (), ({n},) or ({n}, k)")
     if is_traced(array):
         if array.ndim == 2:
-            raise ValueError("robust_filter: inside a transformation sigma must be a number or one an axis, (n,)")
+            raise ValueError("robust_filter: inside a transformation sigma must be a number or one per axis, (n,)")
         return jnp.broadcast_to(array, (n,))
     if not np.all(np.isfinite(array)) or (array.ndim < 2 and np.any(array < 0)):
         raise ValueError(f"robust_filter: sigma = {arguments.shown(array.tolist())}; wanted finite numbers ≥ 0")
@@ -89,6 +89,6 @@ def gains(problem: Problem, sigma: Any, n: int) -> Any:
     if np.any(np.abs(a - np.diag(np.diag(a))) > 16 * np.finfo(float).eps * size):
         raise ValueError(
             f"robust_filter: sigma = {arguments.shown(array.tolist())} has σσᵀ = {arguments.shown(a.tolist())}, wanted "
-            "a diagonal one: each column of σ acts on one axis; turn the state's axes so that it does"
+            "a diagonal one: each column of σ acts on one axis. Rotate the axes of the state so that it does."
         )
     return np.sqrt(np.diag(a))

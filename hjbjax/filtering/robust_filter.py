@@ -1,22 +1,22 @@
-"""The robust information state on a grid: which states a deterministic disturbance can explain, and at what cost.
+"""The robust information state on a grid: the states that a deterministic disturbance can explain, and their cost.
 
 For dx/dt = f(x, u) + σw, y = h(x) + rv with unknown w and v in L₂ the information state at time t is
 
     p(x, t) = sup over x₀ and w leading to x(t) = x of { p₀(x₀) + ∫₀ᵗ [ L(x, u) − ½γ² (|w|² + |r⁻¹(y − h(x))|²) ] ds },
 
-the largest cost of a path that ends in x and explains what was seen, less what the disturbances pay. It solves
+the largest cost of a path that ends in x and explains the measurements, minus what the disturbances pay. It solves
 
     p_t = max_w { −Dp·(f + σw) − ½γ²|w|² } + L − ½γ² |r⁻¹(y − h)|²,     p(·, 0) = p₀,
 
-the max-plus twin of the Zakai equation: sums are maxima, products are sums. With y and u held over a step no splitting
-is needed, since what a measurement costs is a source like L: see ``max_plus`` for the scheme. As γ grows, or with
-L = 0, the largest p belongs to Mortensen's minimum-energy estimate.
+the max-plus analogue of the Zakai equation, with maxima instead of sums and sums instead of products. With y and u
+constant over a step no splitting is needed, since the measurement term is a source like L. ``max_plus`` describes the
+scheme. As γ grows, or if L = 0, the maximum of p is Mortensen's minimum-energy estimate.
 
-For a linear system with cost ½ qᵀx² and p₀ = −½γ²(x − x̂)²/Y, p stays such a parabola plus a constant, and
+For a linear system with cost ½ qᵀx² and p₀ = −½γ²(x − x̂)²/Y, p remains such a parabola plus a constant, and
 
-    dY/dt = 2aY + σ² + (q/γ² − c²/r²) Y²,     dx̂/dt = a x̂ + bu + (qY/γ²) x̂ + (c/r²) Y (y − c x̂),
+    dY/dt = 2aY + σ² + (q/γ² − c²/r²) Y²,     dx̂/dt = a x̂ + bu + (qY/γ²) x̂ + (c/r²) Y (y − c x̂).
 
-so that a small γ lets Y escape to infinity in finite time: then no controller attenuates that well.
+If γ is too small, Y becomes infinite in finite time. Then no controller attenuates the disturbance that well.
 Source: M. R. James, Nonlinear Control Systems, (12.10) and (12.11).
 """
 
@@ -51,8 +51,8 @@ class RobustState:
     Attributes:
       p: the information state at the nodes after every measurement, shape (k, *grid), in the units of cost.
       worst_case: the state where p is largest, refined between the nodes, shape (k, n).
-      value: the largest p, shape (k,): the worst cost so far that the record admits, in the units of cost.
-      times: the times at which these hold, shape (k,); p₀ at time 0 is not among them.
+      value: the largest p, shape (k,): the worst cost so far that the record allows, in the units of cost.
+      times: the time of each entry, shape (k,); p₀ at time 0 is not included.
     """
 
     p: Any
@@ -63,30 +63,29 @@ class RobustState:
 
 @pytree_dataclass(static=("scheme",))
 class RobustGridFilter:
-    """The robust information state as an observer: its state is p at the nodes, shape (*grid).
+    """The robust information state as an observer, whose state is p at the nodes, shape (*grid).
 
-    The estimate is the worst case, the state where p is largest. Periodic axes are wrapped; at the ends of the others
-    nothing flows in, be they projected or constrained. Steps of any length are stable: ``update`` makes as many inner
-    ones as the velocities want.
+    The estimate is the worst case, the state where p is largest. Periodic axes are wrapped. At the ends of other axes
+    nothing flows in, whether they are projected or constrained. Steps of any length are stable: ``update`` makes as
+    many inner steps as the velocities require.
 
     Args:
-      problem: f, L and the admissible controls, as in ``hjb.solve``; discount, target and costs at the end are not
-        read.
+      problem: f, L and the admissible controls, as in ``hjb.solve``; discount, target and boundary costs are ignored.
       h: the measured quantity, a function of one state that returns shape (p,).
       grid: the nodes.
       initial: p₀, a function of one state or node values (*grid), in the units of cost; defined up to a constant.
-      gamma: γ > 0, in √(cost) over the size of the disturbances.
+      gamma: γ > 0, in √(cost) per size of the disturbances.
 
     Keyword Args:
-      sigma: the gain of w: a number, one an axis (n,), or a matrix (n, k) with σσᵀ diagonal. ``None``: the noise of the
-        problem, and without noise the identity.
-      measurement_noise: r: a number, one a measurement (p,), or a matrix (p, p), in the units of h.
-      scheme: slopes: ``Weno5()``, fifth order where p is smooth; ``Limited()``, second; ``Upwind()``, first, monotone.
+      sigma: the gain of w: a number, one per axis (n,), or a matrix (n, k) with σσᵀ diagonal. Default: the noise of
+        the problem, or the identity if there is no noise.
+      measurement_noise: r: a number, one per measurement (p,), or a matrix (p, p), in the units of h.
+      scheme: ``Weno5()``, order 5 where p is smooth; ``Limited()``, order 2; ``Upwind()``, order 1 and monotone.
 
     Raises:
       ValueError: a number that is not admissible, functions or node values of the wrong shape, p₀ that is not finite,
         a matrix σ whose columns act on several axes, open ends, an opponent or a problem that depends on time.
-      TypeError: something else than a Problem, a Grid or a function.
+      TypeError: an argument that is not a Problem, a Grid or a function.
 
     Example:
       >>> import hjbjax as hjb
@@ -143,11 +142,11 @@ class RobustGridFilter:
 
     @front_door
     def update(self, state: Field, u: Control, dy: Array | None, dt: Number) -> Field:
-        """p after holding the control u (m,) for a time dt, in which y = dy/dt was seen, dy (p,), or nothing (None)."""
+        """p after applying the control u (m,) for dt and measuring y = dy/dt over it, dy (p,), or None."""
         self._check_state(state)
         check_step("RobustGridFilter.update", self.problem, self.measurement.dim, (u, dy, dt))
         dtype = state.dtype
-        # compiled even where the caller does not: a loop whose body is new would be compiled at every call
+        # compiled even if the caller does not compile: the loop body is a new function, which JAX would compile again
         y = None if dy is None else jnp.asarray(dy, dtype) / dt
         return _after(as_jax(self), state, jnp.asarray(u, dtype), y, dt)[0]
 
@@ -158,22 +157,22 @@ class RobustGridFilter:
         return _largest(state, cast(self.grid, state.dtype))[1]
 
     def _check_state(self, state: Field) -> None:
-        """Refuse the state of another filter, or of this one on another grid."""
+        """Refuse the state of another filter or of another grid."""
         if np.shape(state) != self.grid.shape:
             raise ValueError(
-                f"RobustGridFilter: the state has shape {np.shape(state)}, wanted {self.grid.shape}: one number a node"
+                f"RobustGridFilter: the state has shape {np.shape(state)}, wanted {self.grid.shape}: one entry per node"
             )
 
     @front_door
     def correct(self, state: Field, y: Array, *, measurement_noise: Numbers | Sequence) -> Field:
-        """p after a sample y = h(x) + s v, shape (p,), at one time: its error costs ½γ²|v|².
+        """p after a sample y = h(x) + s v, shape (p,), at one time; its error costs ½γ²|v|².
 
         Args:
           state: p before.
           y: the sample, shape (p,), in the units of h.
 
         Keyword Args:
-          measurement_noise: s, a number, (p,) or (p, p): a sample that is off by s costs ½γ².
+          measurement_noise: s, a number, (p,) or (p, p); a sample with an error of s costs ½γ².
 
         Raises:
           ValueError: a sample or a noise of the wrong shape, or not finite.
@@ -195,12 +194,12 @@ class RobustGridFilter:
     def _after(
         self, p: Field, u: Control, y: Array | None, dt: Number, most: int | None = None
     ) -> tuple[Field, jax.Array]:
-        """p a time dt later, with control and measurement held, and the number of inner steps."""
+        """p after the time dt with constant control and measurement, and the number of inner steps."""
         mine = cast(self, p.dtype)
         on = Discretisation(mine.problem, mine.grid, self.scheme, p.dtype)
         entries = [u[k] for k in range(u.shape[0])]
         misfit = 0.0 if y is None else mine._misfit(mine.measurement, y)
-        # slopes alone are asked of the scheme: noise would make some of them central, wrong without second derivatives
+        # the scheme gets the problem without noise: with noise some slopes would be central, which is wrong for p
         bare = dataclasses.replace(on, problem=Problem(mine.problem.drift))
         return MaxPlusMarch(
             bare,
@@ -228,38 +227,39 @@ def robust_filter(
     measurement_noise: Numbers | Sequence = 1.0,
     scheme: Scheme = Weno5(),
 ) -> RobustState:
-    """The robust information state along a record of measurements, (12.10) and (12.11) of the chapter, in float64.
+    """The robust information state along a record of measurements, equations (12.10) and (12.11), in float64.
 
-    p_t = max_w { −Dp·(f + σw) − ½γ²|w|² } + L − ½γ² |r⁻¹(y − h)|², control and measurement held over each interval.
-    In space of the order of the scheme where p is smooth, at its kinks of first order; in time of order 3 inside an
-    interval; stable for intervals of any length. Under ``jit`` and ``vmap``, as over a batch of records, no values are
-    checked, and the answer has the type of the arrays that JAX is set to.
+    p_t = max_w { −Dp·(f + σw) − ½γ²|w|² } + L − ½γ² |r⁻¹(y − h)|², with control and measurement constant over each
+    interval. In space the order is the order of the scheme where p is smooth, and 1 at kinks of p. In time, within an
+    interval, it is the number of stages of the scheme, 3 for ``Weno5()``. Intervals of any length are stable. Under
+    ``jit`` and ``vmap``, for example over a batch of records, values are not checked and the result has JAX's default
+    float type.
 
     Args:
-      problem: f, L and the admissible controls; discount, target and costs at the end are not read.
+      problem: f, L and the admissible controls; discount, target and boundary costs are ignored.
       h: the measured quantity, a function of one state that returns shape (p,).
-      grid: the nodes. At an end that is not periodic nothing flows in; open ends are refused.
-      y: the record, shape (k, p), in the units of h: y over each interval, as its mean or dy/dt.
+      grid: the nodes. Nothing flows in at an end that is not periodic; open ends are refused.
+      y: the record, shape (k, p), in the units of h: the mean of y over each interval, dy/dt.
       dt: the length of an interval, in units of time.
       initial: p₀, a function of one state or node values (*grid), in the units of cost; finite, see below.
 
     Keyword Args:
-      gamma: γ > 0: a smaller one gives the disturbances more room.
-      controls: the controls that were held, shape (k, m); wanted exactly when the problem has controls.
-      sigma: the gain of w, as in ``RobustGridFilter``; ``None``: the noise of the problem, else the identity.
-      measurement_noise: r: a number, one a measurement (p,), or a matrix (p, p), in the units of h.
-      scheme: how slopes are made.
+      gamma: γ > 0; a smaller γ makes disturbances cheaper.
+      controls: the controls that were applied, shape (k, m); required if and only if the problem has controls.
+      sigma: the gain of w, as in ``RobustGridFilter``. Default: the noise of the problem, or the identity.
+      measurement_noise: r: a number, one per measurement (p,), or a matrix (p, p), in the units of h.
+      scheme: the scheme for the slopes.
 
     Returns:
-      A ``RobustState``: p after each interval, where it is largest, and how large.
+      A ``RobustState`` with p after each interval, its maximum and the state at the maximum.
 
     Raises:
-      ValueError: a record, controls or functions of the wrong shape, numbers that are not finite or not positive; p₀
-        that is −∞ somewhere, since slopes need numbers: a known state x₀ is a steep −γ²|x − x₀|²/(2Y) with Y from a few
-        spacings squared on; and p that becomes infinite, where γ is too small for the horizon.
-      TypeError: something else than a Problem, a Grid or a function.
+      ValueError: a record, controls or functions of the wrong shape; numbers that are not finite or not positive; p₀
+        that is −∞ somewhere, since slopes need numbers (for a known state x₀ use a steep −γ²|x − x₀|²/(2Y) with √Y a
+        few spacings); and p that becomes infinite because γ is too small for the horizon.
+      TypeError: an argument that is not a Problem, a Grid or a function.
 
-    Warns where the worst case lies at an end of the box, as with a γ that is near the least.
+    Warns if the worst case is at an end of the box, which happens if γ is close to its minimum.
 
     Example:
       >>> import hjbjax as hjb
@@ -274,7 +274,7 @@ def robust_filter(
     """
     options: Any = {"sigma": sigma, "measurement_noise": measurement_noise, "scheme": scheme}
     robust_arguments.check_question(problem, grid, scheme)
-    # its functions are looked at again in every call, as h is
+    # look for changes in the problem's functions at every call, as for h
     asked = settled(Problem(problem.drift, problem.cost, problem.controls, noise=problem.noise), grid.ndim)
     observer = RobustGridFilter(asked, h, grid, initial, gamma, **options)
     if not is_traced(dt):
@@ -283,7 +283,7 @@ def robust_filter(
     controls = controls_of(controls, "robust_filter: controls", problem, np.shape(y)[:1])
     if is_traced(asked, observer.measurement, grid, y, dt, observer.p0, gamma, controls, sigma):
         return _transformed(observer, jnp.asarray(y), jnp.asarray(controls), dt)
-    # inside somebody's ``jit`` a record of known numbers is filtered at once
+    # inside a caller's ``jit`` too, a record of known numbers is filtered at once
     with jax.core.eval_context(), own_settings(x64=True):
         found, steps = _scan_compiled(*cast((observer, y, controls, float(dt)), np.float64))
         found = jax.tree.map(np.asarray, found)
@@ -291,22 +291,22 @@ def robust_filter(
         first = int(np.argmin(np.all(np.isfinite(found.p.reshape(len(found.p), -1)), axis=1)))
         if steps >= MOST:
             raise ValueError(
-                f"robust_filter: dt = {dt:g} asks for over {MOST} inner steps, wanted an interval in which the "
-                "paths cross fewer cells than that; give a shorter one, or a coarser grid"
+                f"robust_filter: dt = {dt:g} needs more than {MOST} inner steps, because the paths cross too many "
+                "cells within an interval; use a shorter interval or a coarser grid"
             )
         raise ValueError(
             f"robust_filter: p is not finite from interval {first} on, t = {first * dt:g} to {(first + 1) * dt:g}: the "
-            "cost grows faster than the disturbances pay for it; take a larger gamma, a smaller box or a shorter record"
+            "cost grows faster than the disturbances pay for it; use a larger gamma, a smaller box or a shorter record"
         )
     warn_at_ends("robust_filter", grid, found.worst_case, float(dt), "the worst case")
     return found
 
 
 def _transformed(observer: RobustGridFilter, y: jax.Array, controls: jax.Array, dt: Any) -> RobustState:
-    """The information state under a transformation: its derivatives in forward mode, and in reverse where they can be.
+    """The information state under a transformation, with derivatives in forward mode and, if possible, in reverse.
 
-    A loop has a reverse derivative if the number of its steps is known. Under ``grad`` alone it is: counts are
-    integers, without a derivative, and come back as plain numbers. Under ``jit`` and ``vmap`` the loop stays open.
+    A loop has a reverse derivative if the number of its steps is known. This is so under ``grad`` without ``jit``:
+    counts are integers without a derivative, so they are plain numbers. Under ``jit`` and ``vmap`` they are traced.
     """
     observer = as_jax(observer)
     found, steps = _scan_compiled(observer, y, controls, dt)

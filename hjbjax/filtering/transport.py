@@ -1,13 +1,13 @@
-"""Transport of a law along states that have little noise or none, such as a position driven by a velocity.
+"""Transport of a law along axes with little or no noise, for example a position driven by a velocity.
 
-The chain moves mass upwind, which adds the diffusion h|f| to an axis with spacing h. Where the noise a is smaller, the
-law of the chain is too wide by the rest. With the excess speed s = max(|f| − a/h, 0) the flux
+The chain moves mass upwind, which adds the diffusion h|f| to an axis with spacing h. If the noise a is smaller, the law
+of the chain is too wide by the difference. With the excess speed s = max(|f| − a/h, 0) and q = s p, the flux
 
     F_{i+1/2} = f_i p_i + δ_i,    δ_i = min(|Δ⁺|, |Δ⁻|, (2|Δ⁺| + |Δ⁻|)/6),    Δ⁺ = q_{i+1} − q_i,  Δ⁻ = q_i − q_{i−1},
 
-q = s p, takes that rest away again; δ has the sign of both differences and is zero where their signs differ. The scheme
-is conservative and of second order where s p is smooth and monotone. Since |δ_i| ≤ q_i it keeps p ≥ 0 in steps
-τ ≤ 1/max(Q + Σ s/h), at most half as long as those of the chain.
+removes the difference. δ has the sign of both differences, and is zero if their signs differ. The scheme is
+conservative and has order 2 where s p is smooth and monotone. Since |δ_i| ≤ q_i, it keeps p ≥ 0 for steps
+τ ≤ 1/max(Q + Σ s/h), which may be half as long as the steps of the chain.
 
 Source: B. Koren, A robust upwind discretization method for advection, diffusion and source terms (1993).
 """
@@ -23,7 +23,7 @@ from hjbjax.problem.grid import Grid
 
 
 class Correction(NamedTuple):
-    """The flux that takes away the diffusion of upwinding, in one direction along an axis.
+    """The flux that removes the diffusion of upwinding, in one direction along an axis.
 
     Attributes:
       ahead: the offset to the next node in the direction.
@@ -37,7 +37,7 @@ class Correction(NamedTuple):
 
 
 def corrections(on: Discretisation, u: list, axes: tuple[int, ...]) -> list[Correction]:
-    """The corrections along some axes under the control u, a list of m components."""
+    """The corrections along the given axes under the control u, a list of m components."""
     grid = on.grid
     found: list[Correction] = []
     if not axes:
@@ -46,7 +46,7 @@ def corrections(on: Discretisation, u: list, axes: tuple[int, ...]) -> list[Corr
     for axis in axes:
         link, a = stencil.links(grid, axis), correlated_noise.along_axis(noise, grid, axis)
         for step, length in ((1, link.up), (-1, link.down)):
-            # no flux crosses a wall; the chain has the diffusion h f where the noise is smaller
+            # no flux crosses a wall; upwinding adds the diffusion h f, of which only the part above a is removed
             speed = jnp.where(stencil.wall(grid, axis, step), 0, jnp.maximum(step * drift[axis], 0))
             excess = speed if a is None else jnp.maximum(speed - jnp.maximum(a, 0) / length, 0)
             rate = jnp.broadcast_to(jnp.asarray(excess / length, on.dtype), grid.shape)
@@ -55,7 +55,7 @@ def corrections(on: Discretisation, u: list, axes: tuple[int, ...]) -> list[Corr
 
 
 def gained(grid: Grid, correction: Correction, p: jax.Array) -> jax.Array:
-    """The mass per unit time that every node gains by a correction, shape (*grid); its sum is zero."""
+    """The mass per unit time that every node gains from a correction, shape (*grid); its sum is zero."""
     q = correction.rate * p
     ahead = stencil.neighbour(q, grid, correction.ahead, ghost=False) - q
     behind = q - stencil.neighbour(q, grid, correction.behind, ghost=False)
@@ -65,7 +65,7 @@ def gained(grid: Grid, correction: Correction, p: jax.Array) -> jax.Array:
 
 
 def largest_rates(on: Discretisation, u: list) -> jax.Array:
-    """The largest s/h along every axis, shape (n,): zero where the noise of the axis makes corrections needless."""
+    """The largest s/h along every axis, shape (n,); zero where the noise is large enough to need no correction."""
     axes = tuple(range(on.grid.ndim))
     rates = [jnp.max(each.rate) for each in corrections(on, u, axes)]
     return jnp.stack([jnp.maximum(*rates[2 * axis : 2 * axis + 2]) for axis in axes])

@@ -1,5 +1,6 @@
-"""H at a node, and its min-max over the admissible sets, by exact formulas or by samples.
+"""The Hamiltonian at a node, and its min-max over the admissible sets, by exact formulas or by samples.
 
-Read ``discrete`` first. ``players`` finds how H depends on each player, ``piecewise`` has the exact optima,
-``search`` the searches, and ``pointwise`` the minimum at one state for Pontryagin's equations.
+Read ``discrete`` first. ``players`` finds how H depends on each player, ``exact`` finds exact optima by ``piecewise``,
+``ball`` or ``quadratic_program``, ``search`` has the searches, and ``pointwise`` the minimum at one state for
+Pontryagin's equations.
 """

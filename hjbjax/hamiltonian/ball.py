@@ -1,9 +1,9 @@
-"""The exact optimum over a ball of a separable quadratic cost plus piecewise linear gains, one gain an input.
+"""The exact optimum over a ball of a separable quadratic cost plus piecewise linear gains, one gain per input.
 
-On each combination of the gains' pieces the objective is a quadratic, Σ b_j u_j + c_j u_j². Its optimum is its
-stationary point or lies on the sphere, where −(2C + μ)⁻¹b has a multiplier μ ≥ 0 of the radius; or some inputs sit at
-kinks, and the others have what these leave of the ball. All combinations are tried, and each candidate is admissible
-and judged by its own value. ``sign`` is +1 to minimise and −1 to maximise; all numbers are per-node scalars.
+For each combination of the gains' pieces the objective is a quadratic, Σ b_j u_j + c_j u_j². Its optimum is its
+stationary point or lies on the sphere, at −(2C + μ)⁻¹b with a multiplier μ ≥ 0 of the radius. Some inputs may instead
+be at kinks, and the others use the rest of the ball. All combinations are tried. Each candidate is admissible and is
+compared by its own value. ``sign`` is +1 to minimise and −1 to maximise; all numbers are per-node scalars.
 """
 
 import functools
@@ -19,13 +19,13 @@ from hjbjax.discretisation.stencil import PerNode
 from hjbjax.hamiltonian.piecewise import Kinked, inverse, inverse_root
 from hjbjax.hamiltonian.search import Action, Best, best_of, better, pick
 
-# Steps for the multiplier, monotone and at last quadratic: of a million sets of numbers over 24 orders of magnitude
-# the slowest took eleven to 1e-10, of two or three inputs.
+# Steps for the multiplier, monotone and finally quadratic. For a million sets of numbers over 24 orders of magnitude,
+# with two or three inputs, the slowest needed eleven steps to 1e-10.
 NEWTON = 12
 
 
 class Branch(NamedTuple):
-    """One choice of an input: to follow the slope of a piece (``kink`` None), or to sit at a kink."""
+    """One choice of an input: to follow the slope of a piece (``kink`` None), or to be at a kink."""
 
     slope: PerNode
     kink: PerNode | None = None
@@ -40,17 +40,17 @@ def kinked_ball(
     *,
     curved: bool,
 ) -> Action:
-    """The optimum over |u| ≤ radius of Σ_j (l_j u_j + q_j u_j² + gain_j(b_j + G_j u_j)), one gain an input at most.
+    """The optimum over |u| ≤ radius of Σ_j (l_j u_j + q_j u_j² + gain_j(b_j + G_j u_j)), at most one gain per input.
 
-    Exact unless the cost is concave for this player at a node, sign · q_j < 0: then a quadratic may have a second
+    Exact unless the cost is concave for this player at a node, sign · q_j < 0. Then a quadratic may have a second
     local optimum on the sphere, in the cell of a combination whose best point lies in another cell.
 
     Args:
       sign: +1 to minimise, −1 to maximise.
-      radius: of the ball.
+      radius: the radius of the ball.
       linear, square: l and q for every input.
       pieces: the gain of every input, or None.
-      curved: true if a q may differ from zero.
+      curved: True if a q may differ from zero.
     """
 
     def total(action: Action) -> PerNode:
@@ -71,7 +71,7 @@ def kinked_ball(
 
 
 def combinations(pieces: Sequence[int]) -> int:
-    """How many combinations are tried where the inputs' gains have so many pieces, with a kink between any two."""
+    """The number of combinations for inputs whose gains have the given numbers of pieces, with kinks between them."""
     return math.prod(2 * count - 1 for count in pieces)
 
 
@@ -93,7 +93,7 @@ def _linear_optimum(sign: int, radius: PerNode, choice: Sequence[Branch]) -> Act
 
 
 def _room(radius: PerNode, spent: PerNode) -> tuple[jax.Array, jax.Array]:
-    """What brings inputs at kinks with a sum of squares onto the sphere if they lie outside; and the radius left."""
+    """The factor that moves inputs at kinks onto the sphere if they are outside, and the remaining radius."""
     shrink = jnp.where(spent > radius * radius, radius * inverse_root(spent), 1)
     room = radius * radius - spent
     return shrink, jnp.where(room > 0, jnp.sqrt(jnp.where(room > 0, room, 1)), 0)
@@ -106,7 +106,7 @@ def _best_of_quadratics(
     branches: Sequence[Sequence[Branch]],
     total: Callable[[Action], PerNode],
 ) -> Action:
-    """The best of the optima on all combinations of branches, in a loop: written out they compile for long."""
+    """The best of the optima for all combinations of branches, in a loop, because written out it compiles slowly."""
     centre: Action = [jnp.zeros(())] * len(branches)
     value = jnp.asarray(total(centre))
     start: Best = (value, [jnp.zeros_like(value) for _ in centre], [])
@@ -118,7 +118,7 @@ def _best_of_quadratics(
         free = least_in_ball(
             left,
             [jnp.where(follows, sign * slope, 0) for follows, slope, _ in picked],
-            # what sits at a kink is as stiff as can be, and moves nowhere
+            # an input at a kink gets infinite stiffness, so it does not move
             [jnp.where(follows, sign * c, jnp.inf) for c, (follows, _, _) in zip(square, picked, strict=True)],
         )
         action = [jnp.where(follows, u, shrink * kink) for u, (follows, _, kink) in zip(free, picked, strict=True)]
@@ -128,7 +128,7 @@ def _best_of_quadratics(
 
 
 def _picked(options: Sequence[Branch], number: jax.Array) -> tuple[jax.Array, PerNode, PerNode]:
-    """Whether the branch of a number, known while running, follows a slope; that slope, and its kink."""
+    """For the branch with a traced number: True if it follows a slope, that slope, and its kink."""
     follows = number < sum(each.kink is None for each in options)  # slopes come before kinks
     slope, kink = options[0].slope, jnp.zeros(())
     for k, each in enumerate(options[1:], start=1):
@@ -142,36 +142,36 @@ def _picked(options: Sequence[Branch], number: jax.Array) -> tuple[jax.Array, Pe
 def least_in_ball(radius: PerNode, slope: Sequence[PerNode], square: Sequence[PerNode]) -> list[jax.Array]:
     """The minimum of b·u + Σ c_j u_j² over |u| ≤ r: u = −b/(2c + μ); the centre where b = 0 and c ≥ 0.
 
-    1/|u| − 1/r is concave and increasing in μ, so Newton's method from the left rises to the root. Where c is one
-    number it is linear, and the first μ is the root. Some c < 0 leave the sphere alone, where |u|² is a constant:
-    with the least c taken off all of them it is the same minimum, and nothing is concave. An input with c = ∞ stays
-    at zero.
+    1/|u| − 1/r is concave and increasing in μ, so Newton's method from the left rises to the root. If all c are equal
+    it is linear, and the first μ is the root. If some c < 0, the minimum is on the sphere, where |u|² is constant:
+    subtracting the smallest c from all of them leaves the same minimum, and nothing is concave. An input with c = ∞
+    stays at zero.
     """
-    there = radius > 0  # a ball of one point: nothing is divided by its radius
+    there = radius > 0  # False for a ball that is one point, to avoid dividing by its radius
     radius = jnp.where(there, radius, 1)
     least = functools.reduce(jnp.minimum, square)
     concave = least < 0
     curvature = [2 * (c - jnp.minimum(least, 0)) for c in square]
     inner = [-b / jnp.where(k > 0, k, 1) for b, k in zip(slope, curvature, strict=True)]
-    # the free minimum counts only where it exists: an input without curvature but with a slope runs to the sphere
+    # the free minimum counts only if it exists: an input without curvature but with a slope runs to the sphere
     exists = functools.reduce(jnp.logical_and, ((k > 0) | (b == 0) for b, k in zip(slope, curvature, strict=True)))
     inside = exists & (_dot(inner, inner) <= radius * radius) & ~concave
-    # b = 0 is no rare case, and on the sphere nothing has a derivative there: other numbers take its place
+    # b = 0 is common, and has no derivative on the sphere, so compute with other numbers there
     nothing = _dot(slope, slope) <= jnp.finfo(jnp.result_type(*slope)).tiny
     found = _on_sphere(radius, *([jnp.where(nothing, 1, e) for e in each] for each in (slope, curvature)))
     bound = [jnp.where(nothing, 0, u) for u in found]
-    # without a slope along the most concave input both ways to the sphere are as good: up
+    # without a slope along the most concave input both directions to the sphere are equally good: use the positive one
     room = jnp.maximum(radius * radius - _dot(bound, bound), 0)
     aside = concave & (room > 1e-6 * radius * radius)
     rest = jnp.where(aside, jnp.sqrt(jnp.where(aside, room, 1)), 0)
     for j, c in enumerate(square):
         bound[j] += jnp.where(c == least, rest, 0)
-        rest = jnp.where(c == least, 0, rest)  # one input takes all of it
+        rest = jnp.where(c == least, 0, rest)  # one input takes all of the rest
     return [jnp.where(there, jnp.where(inside, i, b), 0) for i, b in zip(inner, bound, strict=True)]
 
 
 def _on_sphere(radius: PerNode, slope: Sequence[PerNode], curvature: Sequence[PerNode]) -> list[jax.Array]:
-    """−b/(k + μ) with the multiplier μ ≥ 0 at which its norm is the radius, or 0 where it is less; k ≥ 0, b ≠ 0."""
+    """−b/(k + μ) with the multiplier μ ≥ 0 for which its norm is the radius; μ = 0 if it is shorter; k ≥ 0, b ≠ 0."""
     tiny = jnp.finfo(jnp.result_type(*slope)).tiny
     known = jax.lax.stop_gradient((radius, list(slope), list(curvature)))
 
@@ -182,8 +182,8 @@ def _on_sphere(radius: PerNode, slope: Sequence[PerNode], curvature: Sequence[Pe
         rise = jnp.maximum(sum(v * v / part for v, part in zip(u, parts, strict=True)), tiny)  # −½ d|u|²/dμ
         return jnp.maximum(mu + (norm / radius - 1) * norm * norm / rise, 0)
 
-    # |u| ≥ |b|/(max k + μ) and |u| ≥ |b_j|/(k_j + μ): at this μ the norm is at least r, so that Newton's method
-    # starts left of the root; without the second a tiny b_j where k_j is least would take more steps than there are
+    # |u| ≥ |b|/(max k + μ) and |u| ≥ |b_j|/(k_j + μ): at this μ the norm is at least r, so Newton's method starts left
+    # of the root. Without the second bound, a tiny b_j where k_j is smallest would need more than NEWTON steps
     at, slopes, bends = known
     stiffest = functools.reduce(jnp.maximum, bends)
     mu = functools.reduce(
@@ -192,7 +192,7 @@ def _on_sphere(radius: PerNode, slope: Sequence[PerNode], curvature: Sequence[Pe
         jnp.sqrt(_dot(slopes, slopes)) / at - stiffest,
     )
     mu = jax.lax.fori_loop(0, NEWTON - 2, lambda _, mu: newton(mu, *known), jnp.maximum(mu, 0))
-    for _ in range(2):  # of a root that is found these steps alone carry its first two derivatives
+    for _ in range(2):  # at the root these two steps are enough for its first two derivatives
         mu = newton(mu, radius, slope, curvature)
     return [jnp.asarray(-b / jnp.where(k + mu > 0, k + mu, 1)) for b, k in zip(slope, curvature, strict=True)]
 

@@ -1,13 +1,13 @@
-"""Functions whose derivatives in the two modes come from two programs.
+"""Functions whose forward and reverse derivatives come from two programs.
 
-A loop of unknown length, as of an integrator with adaptive steps, can be differentiated forward as it stands; reverse
-mode wants another one, with checkpoints, which has no forward mode. Here one function has both. With L the derivative
-at a point, its product L a is found by the first program and Lᵀ y by the second: the two halves of
+A loop of unknown length, such as an integrator with adaptive steps, has forward derivatives. Reverse mode needs another
+loop, with checkpoints, which has no forward mode. Here one function gets both. With L the derivative at a point, the
+first program computes L a and the second Lᵀ y, the two halves of
 
     [ I  0] [a]   [b]                   [I  −Lᵀ] [a]
-    [−L  I] [y] = [c]    and of         [0    I] [y],
+    [−L  I] [y] = [c]    and of         [0    I] [y].
 
-which JAX's ``custom_linear_solve`` asks for one at a time, and knows how to batch.
+JAX's ``custom_linear_solve`` calls one of them at a time and knows how to batch both.
 """
 
 import functools
@@ -22,14 +22,14 @@ from hjbjax.problem.settings import own_settings
 
 
 def with_both_modes(forward: Callable[[Any], Any], backward: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The function of a pytree that ``forward`` computes, with reverse derivatives of ``backward``.
+    """The function of a pytree computed by ``forward``, with the reverse derivatives of ``backward``.
 
     Args:
-      forward: a function of a pytree, which is differentiated forward.
-      backward: a program for the same numbers, which is differentiated by reverse mode.
+      forward: a function of a pytree with forward derivatives.
+      backward: a program for the same numbers with reverse derivatives.
 
     Returns:
-      The function. Its second derivatives are refused, by ``NotImplementedError``.
+      The function. Its second derivatives raise ``NotImplementedError``.
 
     Example:
       >>> halve = lambda x: jax.lax.while_loop(lambda y: y > 1, lambda y: y / 2, x)  # has no reverse mode
@@ -73,8 +73,8 @@ def with_both_modes(forward: Callable[[Any], Any], backward: Callable[[Any], Any
 def _product(forward: Callable, backward: Callable, numbers: list, moves: list) -> list:
     """L a for a = ``moves``: by forward mode of one program, transposed by reverse mode of the other."""
 
-    # One program each, also under a ``grad`` without ``jit``. The caller's checks for infinity then see the derivative
-    # and not the bounds inside an integrator.
+    # one program each, even under ``grad`` without ``jit``; the caller's checks for infinity then see the derivative
+    # but not the bounds inside an integrator
     @jax.jit
     def push(move: list) -> list:
         return jax.jvp(forward, (numbers,), (move,))[1]
@@ -90,11 +90,11 @@ def _product(forward: Callable, backward: Callable, numbers: list, moves: list) 
         return jax.tree.map(jnp.add, right[0], pull(right[1])), right[1]
 
     def operator(x: tuple) -> tuple:
-        # never evaluated, and no loop of unknown length, which could not be transposed here; it is asked for its
-        # derivative alone, for second derivatives
+        # never evaluated, and without a loop of unknown length, which could not be transposed here; JAX only
+        # differentiates it, for second derivatives
         return jax.tree.map(lambda entry: entry + once(numbers, "a path").astype(entry.dtype), x)
 
-    # JAX transposes a right-hand side only as a whole: each entry, a zero as well, must depend on the moves
+    # JAX transposes a right-hand side only as a whole, so each entry, even a zero, must depend on the moves
     zero = sum(jnp.where(False, jnp.sum(move), 0.0) for move in moves)
     right = [(move + zero).astype(number.dtype) for move, number in zip(moves, numbers, strict=True)]
     nothing = [jnp.broadcast_to(zero, each.shape).astype(each.dtype) for each in jax.eval_shape(forward, numbers)]
@@ -103,10 +103,10 @@ def _product(forward: Callable, backward: Callable, numbers: list, moves: list) 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def once(numbers: Any, what: str) -> jax.Array:
-    """Zero, whose derivative is refused: added to a derivative it says that there is no second one of ``what``.
+    """Zero, with a derivative that is refused: added to a first derivative it refuses the second one of ``what``.
 
     Raises:
-      NotImplementedError: where it is differentiated.
+      NotImplementedError: if it is differentiated.
     """
     return jnp.zeros(())
 
@@ -114,14 +114,14 @@ def once(numbers: Any, what: str) -> jax.Array:
 @once.defjvp
 def _refuse(what: str, primals: Any, tangents: Any) -> Any:
     """Refuse the derivative."""
-    raise NotImplementedError(f"second derivatives of {what} are not available; differentiate its first ones by steps")
+    raise NotImplementedError(f"second derivatives of {what} are not available; use differences of first derivatives")
 
 
 def _is_real(leaf: Any) -> bool:
-    """True for floating-point numbers, which can be moved."""
+    """True for floating-point numbers, which have derivatives."""
     return jnp.issubdtype(jnp.result_type(leaf), jnp.floating) if not _is_key(leaf) else False
 
 
 def _is_key(leaf: Any) -> bool:
-    """True for typed random keys, whose type is none of NumPy's."""
+    """True for typed random keys, whose dtype is not a NumPy type."""
     return jax.dtypes.issubdtype(getattr(leaf, "dtype", np.dtype(int)), jax.dtypes.prng_key)

@@ -4,9 +4,9 @@ At a node, for one action of each player,
 
     H(u, d) = L(x, u, d) + Σ_o c_o(x, u, d) (V(x + o) − V(x)),
 
-written with one-sided differences, so that nothing but the value is read from memory: with D⁺, D⁻ along an
-axis the gain of a drift component f is [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻). As a function of u it has
-kinks where f changes sign (and at |f| = a/h under central differences): minimising it is piecewise (see ``optimum``).
+written with one-sided differences, so that only the value is read from memory. With D⁺, D⁻ along an axis the gain of a
+drift component f is [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻). As a function of u it has kinks where f changes sign
+(and at |f| = a/h with central differences), so its minimisation is piecewise (see ``optimum``).
 """
 
 import dataclasses
@@ -27,21 +27,21 @@ from hjbjax.problem.pytree import tie
 
 @dataclasses.dataclass(frozen=True)
 class DiscreteHamiltonian:
-    """The Hamiltonian around one value function: coordinates, slopes, and how to evaluate H(u, d).
+    """The Hamiltonian around one value function: coordinates, slopes, and the evaluation of H(u, d).
 
     Attributes:
       on: the problem on its grid.
       x: the coordinates of the nodes.
       value: V at the nodes.
-      up, down: the slopes that drift sees; D⁺ and D⁻, or those of a scheme of higher order.
+      up, down: the slopes used by the drift: D⁺ and D⁻, or the slopes of a scheme of higher order.
       links: the distances to the neighbours along every axis.
-      bends: D⁺ − D⁻ along every axis, which noise sees, with the mirror image across a wall.
-      tried: an action of each player that is a candidate beside the samples; with the actions of the last step
-        among them a sampled policy never gets worse.
-      slack: for every axis what is rounding of the drift; None without constrained ends and lost nodes.
-      lost: for every axis whether the next node up and the next node down are lost; None where none is.
-      bare: whether the optimum of H is wanted alone: then its actions take no arrays, and whoever asks for them as well
-        has them searched for twice.
+      bends: D⁺ − D⁻ along every axis, used by the noise, with the mirror image across a wall.
+      tried: an action of each player that is a candidate in addition to the samples. With the actions of the last step
+        as candidates a sampled policy never gets worse.
+      slack: for every axis the size of drifts that count as rounding; None without constrained ends and lost nodes.
+      lost: for every axis, True where the next node up and the next node down are unreachable; None if none is.
+      bare: True if only the optimum of H is needed. Then its actions are not stored in arrays; if they are requested
+        too, they are searched for twice.
     """
 
     on: Discretisation
@@ -61,12 +61,12 @@ class DiscreteHamiltonian:
         return dataclasses.replace(self, on=self.on.asking(problem))
 
     def gain(self, axis: int, f: Any, a: Any) -> Any:
-        """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻), or with other slopes; infinite where f leaves a constrained end.
+        """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻), or with other slopes; infinite if f leaves a constrained end.
 
-        So every candidate for an optimum is judged by what it may do: the kink at f = 0 is among them. A drift that is
-        rounding leads to no lost node, whose value is far above all others.
+        Candidates for an optimum, including the kink at f = 0, are therefore only good if they are admissible. A drift
+        of the size of rounding does not lead to an unreachable node, whose value is far above all others.
         """
-        # sin π is 1e-16 and not 0: times a lost node's value, 1e8 times all others, that would count
+        # sin π is 1e-16 instead of 0; times the value of an unreachable node, 1e8 times all others, it would matter
         if self.lost is not None:
             assert self.slack is not None
             f = jnp.where(edges.strays(f, self.lost[axis], self.slack[axis]), 0, f)
@@ -75,13 +75,13 @@ class DiscreteHamiltonian:
         return gain if out is None else jnp.where(out, jnp.inf, gain)
 
     def _free_gain(self, axis: int, f: Any, a: Any) -> Any:
-        """What ``gain`` is away from constrained ends; with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
-        # f > 0 sees the node above, f < 0 the one below: every neighbour enters with a weight that is not negative
+        """The gain away from constrained ends; with other slopes f⁺ P⁺ + f⁻ P⁻ + a (D⁺ − D⁻)/(h⁺ + h⁻)."""
+        # f > 0 uses the node above, f < 0 the node below, so every neighbour has a nonnegative weight
         upwind = jnp.maximum(f, 0) * self.up[axis] + jnp.minimum(f, 0) * self.down[axis]
         scheme, link = self.on.scheme, self.links[axis]
         if a is None and (scheme.chain.one_way or not scheme.monotone):
             return upwind
-        if not scheme.monotone:  # noise is central already: only the drift has slopes of higher order
+        if not scheme.monotone:  # the noise term is central already: only the drift has slopes of higher order
             # correlated noise may leave a rounding error below zero
             return upwind + jnp.maximum(a, 0) * self.bends[axis] / (link.up + link.down)
         upward, downward = schemes.weights(scheme.chain, f, a, link, self.on.grid, axis)
@@ -90,7 +90,7 @@ class DiscreteHamiltonian:
     def kinks(self, axis: int, a: Any) -> tuple[Sequence[Any], Sequence[Any]]:
         """The drifts along an axis at which the derivative of ``gain`` jumps, and its derivatives between them."""
         scheme, slopes = self.on.scheme, (self.up[axis], self.down[axis])
-        if not scheme.monotone or (a is None and scheme.chain.one_way):  # f⁺ P⁺ + f⁻ P⁻ has its kink where f turns
+        if not scheme.monotone or (a is None and scheme.chain.one_way):  # f⁺ P⁺ + f⁻ P⁻ has its kink at f = 0
             return (0.0,), slopes[::-1]
         width = 0 if a is None else jnp.maximum(a, 0)
         return schemes.kinks(scheme.chain, width, slopes, self.links[axis], self.on.grid, axis)
@@ -100,7 +100,7 @@ class DiscreteHamiltonian:
         a, grid = self.on.diffusion(u, d, self.x), self.on.grid
         first, *others = self.on.drifts(u, d, self.x)
         total = self.on.running_cost(u, d, self.x)
-        # axis after axis, so that XLA fuses all of H into one pass over V
+        # one axis after the other, so that XLA fuses all of H into one pass over V
         for axis in range(grid.ndim):
             total = total + self.gain(axis, first[axis], correlated_noise.along_axis(a, grid, axis))
             for other in others:
@@ -111,7 +111,7 @@ class DiscreteHamiltonian:
         return jnp.broadcast_to(total, grid.shape)
 
     def _diagonal(self, i: int, j: int, entry: Any) -> Any:
-        """What the jumps along the two diagonals of a pair of axes add for a_ij = ``entry``."""
+        """The contribution of jumps along the two diagonals of a pair of axes for a_ij = ``entry``."""
         grid = self.on.grid
         ends = {
             (p, q): stencil.continued(
@@ -119,7 +119,7 @@ class DiscreteHamiltonian:
             )
             for p, q in itertools.product((1, -1), repeat=2)
         }
-        # for a_ij > 0 the state moves along (1, 1) and (−1, −1), else along (1, −1) and (−1, 1)
+        # for a_ij > 0 the state moves along (1, 1) and (−1, −1), otherwise along (1, −1) and (−1, 1)
         same, opposite = ends[1, 1] + ends[-1, -1], ends[1, -1] + ends[-1, 1]
         scale = 2 * grid.spacing(i) * grid.spacing(j)
         return (
@@ -128,7 +128,7 @@ class DiscreteHamiltonian:
 
 
 def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
-    """A Hamiltonian with slopes D⁺ = s_i and D⁻ = −s_i everywhere: H = L + Σ s_i |f_i| and what noise adds.
+    """A Hamiltonian with slopes D⁺ = s_i and D⁻ = −s_i everywhere: H = L + Σ s_i |f_i| plus the noise terms.
 
     With s > 0, shape (n,), its minimum is zero exactly where an action rests at no cost, if the cost is not negative.
     """
@@ -141,12 +141,12 @@ def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
 def around(
     on: Discretisation, value: jax.Array, lost: jax.Array | None = None, first_order: jax.Array | None = None
 ) -> DiscreteHamiltonian:
-    """Coordinates and differences around ``value``, tied together so that no loop hoists tables out of itself.
+    """The Hamiltonian around ``value``, with coordinates and differences behind one barrier.
 
     ``lost`` and ``first_order`` as in ``Differences``.
     """
     grid = on.grid
-    # without it XLA hoists products of coordinates out of the loop, as arrays of all nodes, one an action
+    # otherwise XLA hoists products of coordinates out of the loop, one array of all nodes per action
     x, value = tie((on.coordinates(), value))
     links = tuple(cut_cells.links(on))
     differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
@@ -157,10 +157,10 @@ def around(
         slopes = jax.tree.map(choose, list(differences), list(slopes))
     up, down = (list(side) for side in zip(*slopes, strict=True))
     for axis, step, end in grid.prescribed("neumann") if on.problem.noise is None else ():
-        # drift that leaves sees the prescribed slope; its mirror image would be a jump that the drift undoes at once
+        # drift that leaves uses the prescribed slope; with the mirror image it would jump and return at once
         side = up if step > 0 else down
         side[axis] = jnp.where(stencil.on_edge(grid, axis, step), jnp.asarray(end.slope, on.dtype), side[axis])
-    # only constrained ends and lost nodes ask what of a drift is rounding, which costs a look at its terms
+    # only constrained ends and unreachable nodes need the rounding of a drift, which requires its separate terms
     careful = lost is not None or grid.sides("constrained")
     slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)

@@ -1,7 +1,7 @@
 """The exact optimum of the discrete Hamiltonian over a box or a ball: its pieces, read from a problem's functions.
 
 The drift is affine in the player's inputs and the cost quadratic (see ``players``), so derivatives at zero give all
-coefficients. ``piecewise``, ``ball`` and ``quadratic_program`` find the optimum of each group of inputs from them.
+coefficients. From them ``piecewise``, ``ball`` and ``quadratic_program`` find the optimum of each group of inputs.
 """
 
 import dataclasses
@@ -34,12 +34,12 @@ class Part:
 
     Attributes:
       hamiltonian: H, around a value.
-      player: whose part it is.
+      player: the player.
       linear: l_j, per-node scalars.
       quadratic: Q_jk by pairs j <= k, for a product j < k the coefficient of u_j u_k; zeros are left out.
       offsets: the components of the drift without this player.
       slopes: for every input the components of ∂f/∂u_j.
-      noise: the entries of a that these gains take with them.
+      noise: the entries of a that are included in these gains.
     """
 
     hamiltonian: DiscreteHamiltonian
@@ -55,7 +55,7 @@ class Part:
         return self.quadratic.get((j, j), jnp.zeros((), self.hamiltonian.on.dtype))
 
     def gain(self, axis: int, group: Sequence[int]) -> Kinked:
-        """The gain of one component as a function of some inputs; of one input, its slope is a number per node."""
+        """The gain of one component as a function of some inputs; for one input, its slope is a number per node."""
         left = correlated_noise.along_axis(self.noise, self.hamiltonian.on.grid, axis)
         slope = [self.slopes[j][axis] for j in group]
         return Kinked(
@@ -80,8 +80,8 @@ def exact_optimum(hamiltonian: DiscreteHamiltonian, player: Player, join: Callab
 def missed(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> jax.Array:
     """A bound on the distance of H at the ``exact_optimum`` to the true optimum, (*nodes), in cost per unit time.
 
-    It is what convexity proves of quadratic programs, and zero up to rounding where the cost is convex for this player.
-    All other optima are those of formulas.
+    The bound follows from convexity for quadratic programs, and is zero up to rounding if the cost is convex for this
+    player. All other optima are exact formulas.
     """
     part = _part(hamiltonian, player, join)
     groups = [group for group, program in zip(player.groups, player.programs, strict=True) if program]
@@ -93,11 +93,11 @@ def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> P
     """The coefficients of a player's part of H."""
     assert isinstance(player.admissible, (Box, Ball))
     on, count = hamiltonian.on, player.admissible.dim
-    # at zero even if that is not admissible: an affine drift is known by its offset and its slopes there
+    # at zero even if zero is not admissible: the offset and slopes there determine an affine drift
     u, d = join([jnp.zeros((), on.dtype)] * count)
     arguments = on.problem.arguments(hamiltonian.x, u, d, on.t)
     parts = on.drifts(u, d, hamiltonian.x)
-    # where drifts are upwinded apart, the noise goes with the control's
+    # if drifts are upwinded separately, the noise belongs to the control's part
     number = 0 if player.sign > 0 else len(parts) - 1
     noise = on.diffusion(u, d, hamiltonian.x) if number == 0 else {}
     slopes = [
@@ -108,7 +108,7 @@ def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> P
 
 
 def _in_ball(part: Part) -> Action:
-    """The optimum over a ball of inputs with a component each."""
+    """The optimum over a ball whose inputs drive one component each."""
     admissible, player = part.player.admissible, part.player
     assert isinstance(admissible, Ball)
     gains = [part.gain(axes[0], [j]) if axes else None for j, axes in enumerate(player.driven)]
@@ -117,7 +117,7 @@ def _in_ball(part: Part) -> Action:
 
 
 def _in_box(part: Part, group: Sequence[int]) -> Action:
-    """The optimum over one input of a box, or over two whose product is not in the cost."""
+    """The optimum over one input of a box, or over two inputs without a product in the cost."""
     admissible, player = part.player.admissible, part.player
     assert isinstance(admissible, Box)
     pieces = [part.gain(i, group) for i in shared(player.driven, group)]
@@ -129,7 +129,7 @@ def _in_box(part: Part, group: Sequence[int]) -> Action:
 
 
 def _programmed(part: Part, group: Sequence[int]) -> tuple[Action, jax.Array]:
-    """The optimum over a group of inputs as a quadratic program, and a bound on what it misses."""
+    """The optimum over a group of inputs as a quadratic program, and a bound on its error."""
     admissible = part.player.admissible
     assert isinstance(admissible, (Box, Ball))
     program, axes = _program(part, group, [part.gain(i, group) for i in shared(part.player.driven, group)])
@@ -140,7 +140,7 @@ def _programmed(part: Part, group: Sequence[int]) -> tuple[Action, jax.Array]:
     for j, each in zip(group, v, strict=True):
         lo, hi = admissible.lo[j], admissible.hi[j]
         inside = (lo + hi) / 2 + (hi - lo) / 2 * each
-        action.append(jnp.where(each == 1, hi, jnp.where(each == -1, lo, inside)))  # an end as it was given
+        action.append(jnp.where(each == 1, hi, jnp.where(each == -1, lo, inside)))  # the exact bounds at the ends
     return action, distance
 
 
@@ -190,8 +190,8 @@ def _program(part: Part, group: Sequence[int], gains: Sequence[Kinked]) -> tuple
 def _jumps(grid: Grid, axis: int, gain: Kinked) -> tuple[PerNode, list[tuple[Any, Any, Any]]]:
     """A gain as base · f + Σ jump max(side (f − kink), 0): the base and the triples (kink, jump, side).
 
-    The base is the smallest slope of all pieces. Next to an unreachable node one of the others is a huge number, which
-    would leave no digits to the rest. A piece that leaves through a constrained end has an infinite jump.
+    The base is the smallest slope of all pieces. Next to an unreachable node another slope is huge, and as the base it
+    would leave no digits for the rest. A piece that leaves through a constrained end has an infinite jump.
     """
     barred = _barred(grid, axis, gain)
     sizes = [jnp.where(out, jnp.inf, jnp.abs(d)) for out, d in zip(barred, gain.derivatives, strict=True)]
@@ -210,7 +210,7 @@ def _jumps(grid: Grid, axis: int, gain: Kinked) -> tuple[PerNode, list[tuple[Any
 
 
 def _barred(grid: Grid, axis: int, gain: Kinked) -> list[Any]:
-    """For every piece of a gain the nodes at which its drifts leave through a constrained end, bool."""
+    """For every piece of a gain, the nodes at which its drifts leave through a constrained end, bool."""
     barred: list[Any] = [np.zeros((), bool)] * len(gain.derivatives)
     for _, step in (each for each in grid.sides("constrained") if each[0] == axis):
         edge = stencil.on_edge(grid, axis, step)
@@ -233,13 +233,13 @@ def _dot(a: Sequence[PerNode], b: Sequence[PerNode]) -> PerNode:
 def _cost_coefficients(
     on: Discretisation, player: Player, arguments: tuple
 ) -> tuple[list[Any], dict[tuple[int, ...], Any]]:
-    """l_j and Q_jk of a cost l·u + Σ Q_jk u_j u_k + ... by differentiation at zero, zeros of Q left out."""
+    """l_j and Q_jk of a cost l·u + Σ Q_jk u_j u_k + ... by differentiation at zero; zeros of Q are left out."""
     cost, count = on.problem.cost, len(player.driven)
     if cost is None:
         return [jnp.zeros((), on.dtype)] * count, {}
     slopes = [player.derivative(on.problem, cost, j) for j in range(count)]
     linear: list[Any] = [components.scalar(slope, *arguments, dtype=on.dtype) for slope in slopes]
-    # what is known to be linear has no second derivatives: they would be traced to find zeros
+    # second derivatives of a linear input are known to be zero, so do not trace them
     pairs = [(j, j) for j in range(count) if player.curved[j]] + sorted(player.products)
     quadratic: dict[tuple[int, ...], Any] = {
         (j, k): components.scalar(player.derivative(on.problem, slopes[j], k), *arguments, dtype=on.dtype)
@@ -250,12 +250,12 @@ def _cost_coefficients(
 
 
 def needs_convexity(on: Discretisation) -> bool:
-    """True if a player's optimum is exact only where its cost is convex for a minimiser, concave for a maximiser."""
+    """True if a player's optimum is exact only for a cost that is convex for a minimiser, concave for a maximiser."""
     return any(_needs_convexity(player) for player in players_of(on).both)
 
 
 def may_miss(on: Discretisation) -> Verdict | bool:
-    """True if a player whose optimum is called exact may miss it at a node, since its cost is not convex there."""
+    """True if an optimum that counts as exact may be wrong at a node, because the cost is not convex there."""
     return needs_convexity(on) and _is_concave(on)
 
 
@@ -267,7 +267,7 @@ def _needs_convexity(player: Player) -> bool:
 
 @jax.jit
 def _is_concave(on: Discretisation) -> Verdict:
-    """True if a cost is not convex for its player at some node, where that matters."""
+    """True if a cost is not convex for its player at some node, and the optimum requires convexity."""
     players, found = players_of(on), jnp.zeros((), bool)
     u, d = ([jnp.zeros((), on.dtype)] * len(player.driven) for player in players.both)
     arguments = on.problem.arguments(on.coordinates(), u, d, on.t)

@@ -1,8 +1,8 @@
 """The optimum of the discrete Hamiltonian over the admissible sets: min, max, min max and max min, node by node.
 
-Exact where the drift is affine in u, the cost quadratic and the noise free of u, by ``exact``; for convex costs the
-number of inputs and what they share do not matter (see ``players``). The best of a finite set. Otherwise samples and a
-pattern search, which may miss the optimum: such solves have no certified bounds.
+Exact if the drift is affine in u, the cost quadratic and the noise independent of u, by ``exact``. For convex costs any
+number of inputs and any coupling is allowed (see ``players``). A finite set is enumerated. Otherwise samples and a
+pattern search are used, which may miss the optimum: such solves have no certified bounds.
 """
 
 from collections.abc import Callable
@@ -21,16 +21,16 @@ from hjbjax.problem.pytree import altered, tie
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.problem.types import Field
 
-INNER = 8  # actions of the player who moves second that are written out, inside the search of the first
+INNER = 8  # actions of the player who moves second to write out, inside the search of the first player
 
 
 def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
-    """min max of H, or max min, as the problem or ``isaacs`` says: the value, the control and the disturbance."""
+    """min max of H, or max min, as in the problem or ``isaacs``: the value, the control and the disturbance."""
     players = players_of(hamiltonian.on)
     if players.disturbance.admissible is None:
         value, u = best_response(hamiltonian, players.control, lambda u: (u, []))
         return value, u, []
-    if players.decoupled:  # H is a sum: each optimum is the same whatever the other does, and so any action serves
+    if players.decoupled:  # H is a sum, so each optimum does not depend on the other player: use any action
         start = _any_action(players.disturbance.admissible)
         _, u = best_response(hamiltonian, players.control, lambda u: (u, start))
         value, d = best_response(hamiltonian, players.disturbance, lambda d: (u, d))
@@ -42,7 +42,7 @@ def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tup
 
 
 def optimal_value(hamiltonian: DiscreteHamiltonian) -> jax.Array:
-    """min max of H, or max min, where nobody asks for the actions: of finitely many none is kept in mind."""
+    """min max of H, or max min, without the actions, which is faster for a finite set."""
     players = players_of(hamiltonian.on)
     player, admissible = players.control, players.control.admissible
     if players.disturbance.admissible is not None or not isinstance(admissible, Finite):
@@ -52,9 +52,9 @@ def optimal_value(hamiltonian: DiscreteHamiltonian) -> jax.Array:
 
 
 def missed(hamiltonian: DiscreteHamiltonian) -> tuple[Field, Field]:
-    """Bounds on what the exact optima of the control and of the disturbance miss, (*grid) each, cost per unit time.
+    """Bounds on the error of the exact optima of the control and of the disturbance, (*grid) each, cost per unit time.
 
-    Zero but for quadratic programs; see ``exact.missed``. Where the optima are searched they say nothing.
+    Zero except for quadratic programs, see ``exact.missed``. They do not cover optima found by a search.
     """
     players = players_of(hamiltonian.on)
     (control, disturbance), none = players.both, jnp.zeros(hamiltonian.value.shape, hamiltonian.on.dtype)
@@ -82,7 +82,7 @@ def best_response(
 ) -> tuple[jax.Array, Action]:
     """One player's optimum against a given action of the other; ``join(mine)`` makes the pair (u, d).
 
-    ``most`` is how many evaluations may be written out, where it samples.
+    ``most`` is the largest number of evaluations to write out when sampling.
     """
     if player.admissible is None:
         return hamiltonian.at(*join([])), []
@@ -95,29 +95,29 @@ def best_response(
             weight=player.effort, most=most, start=start,
         )  # fmt: skip
     if not hamiltonian.bare:
-        action = tie(action)  # or the search is done twice, for the action and for the value
+        action = tie(action)  # otherwise XLA searches twice, for the action and for the value
     return hamiltonian.at(*join(action)), action
 
 
 def _nested(
     hamiltonian: DiscreteHamiltonian, outer: Player, inner: Player, join: Callable
 ) -> tuple[jax.Array, Action, Action]:
-    """The outer player's optimum, who moves first and knows that the inner one answers."""
+    """The optimum of the outer player, who moves first and anticipates the inner player's reply."""
 
     def objective(action):
         return best_response(hamiltonian, inner, lambda reply: join(action, reply), most=INNER)
 
-    if outer.admissible is None:  # a lower game without controls, say: nobody moves first
+    if outer.admissible is None:  # for example a lower game without controls: no player moves first
         value, answer = objective([])
         return value, [], answer
     return _sampled(hamiltonian, outer, objective, weight=inner.weight)
 
 
 def _admissible(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Action | None:
-    """At constrained ends an action of a sampled control that does not leave, where that can be found exactly."""
+    """At constrained ends, an action of a sampled control that does not leave the box, if one can be found exactly."""
     if hamiltonian.slack is None or player.sign < 0:
         return None
-    # without the cost H is the gain alone, infinite outside: the least of it is exact where the drift is affine
+    # without the cost H is the gain, infinite for actions that leave; its minimum is exact for an affine drift
     free = altered(hamiltonian.on.problem, cost=None)
     alone = players_of(hamiltonian.asking(free).on).control
     return exact.exact_optimum(hamiltonian.asking(free), alone, join) if alone.exact else None
@@ -131,7 +131,7 @@ def _sampled(
     most: int = UNROLL,
     start: Action | None = None,
 ) -> Any:
-    """The best of samples, refined by a pattern search between them; of finitely many actions the best of all."""
+    """The best of samples, refined by a pattern search between them; the best of all actions of a finite set."""
     assert player.admissible is not None
     points = jnp.asarray(sets.samples(player.admissible, SAMPLES), hamiltonian.on.dtype)
     if isinstance(player.admissible, Finite):
@@ -147,7 +147,7 @@ def _sampled(
 
 
 def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
-    """The map of an action onto its set: a step of the search may leave it."""
+    """The projection of an action onto its set, because a step of the search may leave the set."""
     if isinstance(admissible, Box):
         return lambda action: [jnp.clip(u, admissible.lo[j], admissible.hi[j]) for j, u in enumerate(action)]
 
@@ -159,7 +159,7 @@ def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
 
 
 def _any_action(admissible: AdmissibleSet | None) -> Action:
-    """Some action of the set; zero need not be one."""
+    """Some action of the set; zero need not belong to it."""
     if admissible is None:
         return []
     if isinstance(admissible, Ball):

@@ -1,8 +1,8 @@
-"""Exact minima of a convex or concave cost plus piecewise linear gains, over one input or two; see ``ball`` for balls.
+"""Exact minima of a convex or concave cost plus piecewise linear gains, over one or two inputs; see ``ball`` for balls.
 
-Under upwinding the Hamiltonian is such a function of the control wherever the drift is affine in it and the cost
-separable and quadratic: each drift component contributes a gain with a kink where it changes sign. ``sign`` is +1 to
-minimise and −1 to maximise; all numbers are per-node scalars.
+With upwinding the Hamiltonian has this form in the control if the drift is affine in it and the cost is separable and
+quadratic: each drift component contributes a gain with a kink where it changes sign. ``sign`` is +1 to minimise and −1
+to maximise. All numbers are per-node scalars.
 """
 
 import itertools
@@ -15,17 +15,17 @@ import jax.numpy as jnp
 from hjbjax.discretisation.stencil import PerNode
 from hjbjax.hamiltonian.search import better
 
-Pair: TypeAlias = Sequence[PerNode]  # one number a node for each of two inputs
+Pair: TypeAlias = Sequence[PerNode]  # one number per node for each of two inputs
 Candidate: TypeAlias = tuple[list[jax.Array], jax.Array]  # an action and its value
 Slope = TypeVar("Slope")
-UNROLLED = 9  # cells up to which the candidates are written out, which is faster: two gains with two kinks each
+UNROLLED = 9  # largest number of cells to write out, which is faster than a loop: two gains with two kinks each
 
 
 class Kinked(Generic[Slope]):
     """A piecewise linear function gain(f) of one drift component f = offset + slope·u, with its kinks in order.
 
-    ``derivatives`` holds the slope of the gain between consecutive kinks: one more than there are kinks. ``slope`` is
-    a number a node, or one for each of two inputs.
+    ``derivatives`` holds the slope of the gain between consecutive kinks, one more than there are kinks. ``slope`` is
+    one number per node, or one for each of two inputs.
     """
 
     def __init__(
@@ -41,20 +41,20 @@ class Kinked(Generic[Slope]):
 
     def on_line(self: "Kinked[Pair]", point: Pair, direction: Pair) -> "Kinked[PerNode]":
         """The gain along point + t · direction, as a function of one input t."""
-        # f = b + G·(point + t direction): only offset and slope change, the kinks are places of f
+        # f = b + G·(point + t direction): only offset and slope change, because kinks are values of f
         at, along = (sum(g * c for g, c in zip(self.slope, vector, strict=True)) for vector in (point, direction))
         return Kinked(self.gain, self.offset + at, along, self.kinks, self.derivatives)
 
 
 def inverse(number: PerNode) -> jax.Array:
-    """1/number, 0 for zero. Slopes vary along few axes, and a product is fused where a quotient fills an array."""
-    zero = number == 0  # the inner where: 1/0 in the branch not taken would be a NaN of the derivative
+    """1/number, 0 for zero. Slopes vary along few axes, so a product can be fused where a quotient fills an array."""
+    zero = number == 0  # the inner where: 1/0 in the unused branch would give NaN derivatives
     return jnp.where(zero, 0, 1 / jnp.where(zero, 1, number))
 
 
 def inverse_root(number: PerNode) -> jax.Array:
     """1/√number, 0 for zero, with a derivative of zero there."""
-    zero = number == 0  # likewise, and the derivative of a root at zero is infinite
+    zero = number == 0  # also because the derivative of a root at zero is infinite
     return jnp.where(zero, 0, 1 / jnp.sqrt(jnp.where(zero, 1, number)))
 
 
@@ -71,15 +71,15 @@ def piecewise_input(
     """The exact optimum over one input u ∈ [lo, hi] of  l u + q u² + Σ_i gain_i(b_i + G_i u).
 
     Each gain is linear between its kinks, so the optimum is an end, a kink, or the stationary point of one choice of
-    pieces, clipped to [lo, hi]; all are tried, also choices that no u makes, so that kinks may coincide. Concave
-    pieces and G_i = 0 need no special care: every candidate is admissible and is judged by its own value.
+    pieces, clipped to [lo, hi]. All are tried, including choices that no u makes, so kinks may coincide. Concave pieces
+    and G_i = 0 need no special treatment: every candidate is admissible and is compared by its own value.
 
     Args:
       sign: +1 to minimise, −1 to maximise.
       lo, hi: the bounds of the input.
       linear, square: l and q, per-node scalars.
       pieces: the gains that this input drives.
-      curved: true if q may differ from zero.
+      curved: True if q may differ from zero.
     """
 
     def total(u: PerNode) -> PerNode:
@@ -87,14 +87,14 @@ def piecewise_input(
         return sum((piece.gain(piece.offset + piece.slope * u) for piece in pieces), start=value)
 
     candidates = [lo, hi]
-    for piece in pieces:  # where b + G u meets a kink; with G = 0 it is 0, which is clipped and harmless
+    for piece in pieces:  # where b + G u meets a kink; with G = 0 the candidate is 0, clipped, which is harmless
         candidates += [jnp.clip((kink - piece.offset) * inverse(piece.slope), lo, hi) for kink in piece.kinks]
     if curved:
-        # 0 = l + 2 q u + Σ G_i d_i for each choice of a piece a gain: all cells, K kinks make (K + 1)^pieces of them
+        # 0 = l + 2 q u + Σ G_i d_i for each choice of one piece per gain: with K kinks there are (K + 1)^pieces choices
         for choice in itertools.product(*(piece.derivatives for piece in pieces)):
             slope = linear + sum(piece.slope * d for piece, d in zip(pieces, choice, strict=True))
             candidates.append(jnp.clip(-slope * inverse(2 * square), lo, hi))
-    # judged by the objective itself: which choice of pieces a candidate belongs to need not be known
+    # compare by the objective, which does not require the choice of pieces that a candidate belongs to
     best: Candidate = [jnp.asarray(candidates[0])], jnp.asarray(total(candidates[0]))
     for u in candidates[1:]:
         best = _better_of(sign, ([jnp.asarray(u)], total(u)), best)
@@ -114,15 +114,15 @@ def piecewise_pair(
     """The exact optimum over two inputs of  l·u + q₁u₁² + q₂u₂² + Σ_i gain_i(b_i + G_i·u)  in a box.
 
     The lines on which a gain has its kink cut the box into cells, in each of which the objective is one quadratic.
-    Its optimum in a cell is its stationary point, or lies on the boundary: on a side of the box or on a line, where
-    the problem is one of a single input. All are tried; every candidate is admissible and judged by its own value.
+    Its optimum in a cell is its stationary point, or is on the boundary, that is on a side of the box or on a line,
+    where the problem has a single input. All are tried; every candidate is admissible and compared by its own value.
 
     Args:
       sign: +1 to minimise, −1 to maximise.
       lo, hi: the bounds of the two inputs.
       linear, square: l and q for both, per-node scalars.
       pieces: the gains; their slopes are pairs.
-      curved: true if a q may differ from zero.
+      curved: True if a q may differ from zero.
     """
 
     def clipped(u: Pair) -> list[jax.Array]:
@@ -144,7 +144,7 @@ def piecewise_pair(
         bend = sum(c * v * v for c, v in zip(square, direction, strict=True))
         restricted = [piece.on_line(point, direction) for piece in others]
         t = piecewise_input(sign, *ends, slope, bend, restricted, curved=curved)
-        # a kink's line may miss the box, and rounding may carry a point over a side: admissible in any case
+        # the line of a kink may miss the box, and rounding may move a point out of it, so clip
         return clipped([x + t * v for x, v in zip(point, direction, strict=True)])
 
     def in_cell(derivatives: Sequence[PerNode]) -> list[jax.Array]:
@@ -170,7 +170,7 @@ def piecewise_pair(
     if len(cells) > UNROLLED:
         corner = clipped([lo[0], lo[1]])
         best: Candidate = corner, jnp.asarray(total(corner))
-        # as on a side: a gain that is constant along its own line does no harm, and all lines are computed alike
+        # as on a side: a gain that is constant along its own line is harmless, and all lines share one computation
         lines = [_kink_line(piece, kink) for piece in pieces for kink in piece.kinks]
         sides += [(tuple(point), tuple(way), _within(point, way, lo, hi)) for point, way in lines]
         for candidate, entries in ((on_side, sides), (in_cell, cells)):
@@ -186,7 +186,7 @@ def piecewise_pair(
 
 
 def _better_of(sign: int, new: tuple[list[jax.Array], PerNode], old: Candidate) -> Candidate:
-    """The better one of two candidates with their values, node by node."""
+    """The better of two candidates with their values, node by node."""
     wins = better(sign, new[1], old[1])
     return [jnp.where(wins, a, b) for a, b in zip(new[0], old[0], strict=True)], jnp.where(wins, new[1], old[1])
 
@@ -194,10 +194,10 @@ def _better_of(sign: int, new: tuple[list[jax.Array], PerNode], old: Candidate) 
 def _best_in_loop(
     sign: int, total: Callable[[list], PerNode], candidate: Callable, entries: Sequence, best: Candidate
 ) -> Candidate:
-    """The best one of a candidate and of others that are computed alike, in a loop, so that one of them is compiled.
+    """The best of one candidate and of others with the same computation, in a loop, so that it is compiled once.
 
-    Central differences of two components have three kinks each, which makes 166 candidates. XLA takes minutes for a
-    program in which all of them are written out.
+    Central differences of two components have three kinks each, which makes 166 candidates. XLA takes minutes to
+    compile a program in which all of them are written out.
     """
     shape = jax.eval_shape(lambda: jnp.asarray(total(candidate(entries[0])))).shape
     value = jnp.broadcast_to(best[1], shape)
@@ -215,9 +215,9 @@ def _best_in_loop(
 
 
 def _kink_line(piece: Kinked[Pair], kink: PerNode) -> tuple[Pair, Pair]:
-    """A point and a unit direction of the line b + G·u = kink; the origin and no direction where G = 0."""
+    """A point and a unit direction of the line b + G·u = kink; the origin and a zero direction if G = 0."""
     g1, g2 = piece.slope
-    # unit length, so that t is a distance in the box whatever the units of G
+    # unit length, so that t is a distance in the box for any units of G
     shrink = inverse_root(g1 * g1 + g2 * g2)
     g1, g2 = g1 * shrink, g2 * shrink
     away = (kink - piece.offset) * shrink
@@ -225,14 +225,14 @@ def _kink_line(piece: Kinked[Pair], kink: PerNode) -> tuple[Pair, Pair]:
 
 
 def _within(point: Pair, direction: Pair, lo: Pair, hi: Pair) -> tuple[jax.Array, jax.Array]:
-    """The range of t in which point + t · direction lies in the box; a line that misses the box gives one t."""
+    """The range of t in which point + t · direction is in the box; a line that misses the box has one t."""
     first: PerNode = -jnp.inf
     last: PerNode = jnp.inf
     for x, v, low, high in zip(point, direction, lo, hi, strict=True):
-        moves = v != 0  # a line along the other axis is bounded by that one alone
+        moves = v != 0  # a line along the other axis is only bounded by that axis
         ends = [(bound - x) * inverse(v) for bound in (low, high)]
         first = jnp.maximum(first, jnp.where(moves, jnp.minimum(*ends), -jnp.inf))
         last = jnp.minimum(last, jnp.where(moves, jnp.maximum(*ends), jnp.inf))
-    # no direction at all, where G = 0, leaves both ends infinite: t = 0 then
+    # a zero direction, where G = 0, leaves both ends infinite: use t = 0
     first = jnp.where(jnp.isfinite(first), first, 0)
     return first, jnp.maximum(first, jnp.where(jnp.isfinite(last), last, 0))

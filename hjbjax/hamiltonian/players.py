@@ -1,6 +1,6 @@
 """The two players: their sets, and how the Hamiltonian depends on them, read from the problem's functions.
 
-The optimum over a player's actions is exact where the drift is affine in them, the noise free of them, and the cost
+The optimum over a player's actions is exact if the drift is affine in them, the noise independent of them, and the cost
 quadratic, over a box or a ball of any dimension. Inputs that drive a common component, or whose product enters the
 cost, form a group. The method depends on the group:
 
@@ -8,11 +8,11 @@ cost, form a group. The method depends on the group:
     a ball, one component per input at most         all combinations of pieces are tried (``ball``)
     any other                                       convex quadratic programs (``quadratic_program``)
 
-The last one requires a cost that is convex for a minimiser and concave for a maximiser. That depends on numbers, which
-are not known here: see ``exact.may_miss``. All three require that the components have few pieces together.
+The last method requires a cost that is convex for a minimiser and concave for a maximiser. This depends on numbers that
+are not known here, see ``exact.may_miss``. All three require that the components have few pieces together.
 
-In a game whose players meet in a component, in a cost or in the noise, only the player who answers is exact. The player
-who moves first faces a function with ridges, which is searched.
+In a game whose players share a component, a cost or the noise, only the player who answers is exact. The player who
+moves first faces a function with ridges, which is searched.
 """
 
 import dataclasses
@@ -30,34 +30,34 @@ from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.tracing import dependence
 from hjbjax.tracing.operations import Operations
 
-SAMPLES = 33  # points of a continuum before refinement
-SHORT = 200  # operations on components up to which evaluations of H are written out one after the other
-# What one evaluation of a longer function counts for, or of one with a contraction: no two are written out in a row. At
-# 300 operations a search that is a loop compiles in half the time (6 s for 12.9), at two layers of 32 likewise; both
-# run as fast as written out.
+SAMPLES = 33  # points of a continuous set before refinement
+SHORT = 200  # largest number of operations on components for which evaluations of H are written out one after the other
+# The weight of one evaluation of a longer function, or of one with a contraction, so that no two are written out in a
+# row. At 300 operations a search in a loop compiles in half the time (6 s instead of 12.9 s), and similarly for two
+# layers of 32; both run as fast as written out.
 ALONE = 80
-CELLS = {1: 64, 2: 16}  # by the inputs of a group: combinations of pieces that are tried at most
-QUADRATICS = 50  # in a ball: three inputs without noise make 27, two with noise 49; programs are faster beyond
+CELLS = {1: 64, 2: 16}  # by the inputs of a group: the largest number of combinations of pieces to try
+QUADRATICS = 50  # in a ball: three inputs make 27 without noise, two make 49 with noise; beyond, programs are faster
 PROGRAMS = 256  # choices of concave kinks, each a convex program: eight components without noise, four with noise
 
 
 @dataclasses.dataclass(frozen=True)
 class Player:
-    """What one player may do and how the Hamiltonian depends on it; static, known from the jaxpr.
+    """The actions of one player and their effect on the Hamiltonian; static, known from the jaxpr.
 
     Attributes:
       admissible: the admissible set, or None.
       sign: +1 minimises, −1 maximises.
-      exact: whether the optimum is found exactly rather than by samples.
+      exact: True if the optimum is found exactly rather than by samples.
       driven: for every input the drift components that it drives.
-      groups: the inputs by what they drive together and by products in the cost; H is a sum over the groups. All inputs
-        of a ball are one group where they are a program.
-      cells: for every group in how many pieces the Hamiltonian may fall.
-      programs: for every group whether its optimum is that of quadratic programs.
-      curved: for every input whether the cost may hold its square.
-      products: the pairs of inputs, the lesser first, whose product the cost may hold.
-      fastest_at_ends: whether no action moves the chain faster than all those at the ends of the set do.
-      effort: how many evaluations of H one counts for where they would be written out.
+      groups: the inputs, grouped by shared drift components and by products in the cost; H is a sum over the groups.
+        All inputs of a ball are one group if they are a program.
+      cells: for every group the number of pieces that the Hamiltonian may have.
+      programs: for every group, True if its optimum is found by quadratic programs.
+      curved: for every input, True if the cost may contain its square.
+      products: the pairs of inputs, the smaller index first, whose product the cost may contain.
+      fastest_at_ends: True if the largest rate of leaving a node is attained at the ends of the set.
+      effort: the weight of one evaluation of H when deciding what to write out.
     """
 
     admissible: AdmissibleSet | None
@@ -73,7 +73,7 @@ class Player:
     effort: int
 
     def derivative(self, problem: Problem, function: Callable, j: int) -> Callable:
-        """∂/∂u_j of a function of the problem's arguments, itself one of one state: it varies only as it must."""
+        """∂/∂u_j of a function of the problem's arguments, as a function of one state without unneeded axes."""
         position = problem.time_dependent + (1 if self.sign > 0 else 2)
 
         def along(*arguments: Any) -> Any:
@@ -90,19 +90,19 @@ class Player:
 
     @property
     def enumerated(self) -> bool:
-        """Whether all of the player's actions are tried, since they are finitely many or there are none."""
+        """True if all of the player's actions are tried, because the set is finite or absent."""
         return isinstance(self.admissible, (Finite, type(None)))
 
     @property
     def weight(self) -> int:
-        """About how many evaluations of H one optimisation takes, each counted by its effort."""
+        """The approximate number of evaluations of H in one optimisation, each weighted by its effort."""
         if self.admissible is None:
             return self.effort
         if isinstance(self.admissible, Finite):
             return len(self.admissible.points) * self.effort
         if not self.exact:  # the pattern search between samples is a loop, which is compiled once
             return SAMPLES * self.effort
-        if any(self.programs):  # a loop in loops, which is compiled once
+        if any(self.programs):  # nested loops, which are compiled once
             return SAMPLES * ALONE
         return self.effort * sum(
             3 + cells if len(group) == 1 else 10 * cells for group, cells in zip(self.groups, self.cells, strict=True)
@@ -110,21 +110,21 @@ class Player:
 
     @property
     def programmed(self) -> bool:
-        """True if the optimum of an exact player is that of quadratic programs, for some inputs."""
+        """True if the optimum of an exact player is found by quadratic programs for some inputs."""
         return self.exact and any(self.programs)
 
 
 @dataclasses.dataclass(frozen=True)
 class Players:
-    """Both players and how they meet.
+    """Both players and their coupling.
 
     Attributes:
       control, disturbance: the players.
-      decoupled: whether H is a sum of what each player does on the grid, too: they drive different components, or each
-        one's drift is upwinded by itself; then the Isaacs condition holds on every grid.
-      disturbance_costs: whether the running cost depends on the disturbance.
-      steers_noise: whether the noise depends on an action.
-      isaacs: who moves first, as in ``Problem``; that player's optimum is searched unless the two are decoupled.
+      decoupled: True if H is a sum over the two players on the grid too, because they drive different components or
+        their drifts are upwinded separately; then the Isaacs condition holds on every grid.
+      disturbance_costs: True if the running cost depends on the disturbance.
+      steers_noise: True if the noise depends on an action.
+      isaacs: the order of the moves, as in ``Problem``; the first player's optimum is searched unless decoupled.
     """
 
     control: Player
@@ -141,15 +141,15 @@ class Players:
 
     @property
     def exact(self) -> bool:
-        """Whether min (max) over the sets is exact, which certificates need."""
+        """True if min (max) over the sets is exact, which certificates require."""
         first, second = (self.control, self.disturbance) if self.isaacs == "upper" else (self.disturbance, self.control)
-        if second.admissible is not None and not self.decoupled:  # the reply is no polynomial of what it replies to
+        if second.admissible is not None and not self.decoupled:  # the reply is not a polynomial in the first action
             return first.enumerated and (second.exact or second.enumerated)
         return all(player.exact or player.enumerated for player in self.both)
 
 
 def players_of(on: Discretisation) -> Players:
-    """The players of a problem on its grid; those whose drifts are upwinded apart do not meet there."""
+    """The players of a problem on its grid; players whose drifts are upwinded separately are decoupled there."""
     players = find_players(on.problem, on.grid.ndim, on.dtype)
     return dataclasses.replace(players, decoupled=players.decoupled or on.apart)
 
@@ -157,7 +157,7 @@ def players_of(on: Discretisation) -> Players:
 def find_players(problem: Problem, n: int, dtype: Any) -> Players:
     """The players of a problem with ``n`` states, read from its functions."""
     found = dependence.influence(problem, n, dtype)
-    branches = 2 if problem.noise is None else 4  # central differences have three kinks a component
+    branches = 2 if problem.noise is None else 4  # central differences have three kinks per component
     return Players(
         _player(problem.controls, 1, found, branches), _player(problem.disturbances, -1, found, branches),
         found.separable and not found.meet, not found.cost.free_of(found.disturbance),
@@ -196,17 +196,17 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
 
 
 def _effort(needed: Operations) -> int:
-    """One for a short function; for a long one so much that a search tries its actions one by one in a loop."""
+    """1 for a short function; for a long one a weight that makes a search try its actions one by one in a loop."""
     return 1 if needed.whole == 0 and needed.single <= SHORT else ALONE
 
 
 def _groups(driven: Sequence[tuple[int, ...]], products: frozenset[tuple[int, ...]]) -> tuple[tuple[int, ...], ...]:
-    """The inputs in groups that have no component and no product in common."""
+    """The inputs in groups that share neither a component nor a product."""
     groups: list[list[int]] = []
     for j, components in enumerate(driven):
         partners = {k for pair in products if j in pair for k in pair}
         meets = [group for group in groups if set(shared(driven, group)) & set(components) or partners & set(group)]
-        # an input that drives what two groups drive makes them one: their pieces depend on one another
+        # an input that shares a component with two groups merges them, because their pieces depend on each other
         joined = [*(k for group in meets for k in group), j]
         groups = [group for group in groups if group not in meets] + [joined]
     return tuple(tuple(sorted(group)) for group in sorted(groups))

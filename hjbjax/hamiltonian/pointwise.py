@@ -2,16 +2,16 @@
 
     H(t, x, p, u) = L(t, x, u) + f(t, x, u)·p,      u*(t, x, p) = argmin of H over the admissible set
 
-Unlike on a grid there is no upwinding, so H has no kinks in u. How it depends on u is read from the jaxpr
-(``dependence``), and the minimum is found accordingly:
+Unlike on a grid there is no upwinding, so H has no kinks in u. The dependence of H on u is read from the jaxpr
+(``dependence``) and selects the method:
 
     Finite                            enumerated
-    Box, separable quadratic in u     the stationary point clipped, input by input; an end where H is affine or concave
+    Box, separable quadratic in u     the stationary point clipped, input by input; an end if H is affine or concave
     Ball, separable quadratic         −(2C + μ)⁻¹b with the multiplier μ ≥ 0 of the radius, by Newton's method
     anything else                     samples, a pattern search, and Newton steps in the inputs that are not at a bound
 
-Where H is affine in an input of a box, u* jumps between the ends: that input is ``jumping``. Between enumerated
-controls it jumps, too. Everything else is a differentiable function of (x, p) away from a change of the bounds met.
+If H is affine in an input of a box, u* jumps between the ends: that input is ``jumping``. Between enumerated controls
+u* jumps too. Otherwise u* is a differentiable function of (x, p), except where the set of active bounds changes.
 """
 
 import dataclasses
@@ -35,12 +35,12 @@ BUDGET = 64  # samples that start a search
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """The way to the minimum of H, read from the jaxpr; hashable, so that it may be a static argument.
+    """The method for the minimum of H, read from the jaxpr; hashable, so that it may be a static argument.
 
     Attributes:
-      exact: true if the formulas above hold; else a search has to do.
+      exact: True if the formulas above hold; False if a search is needed.
       jumping: the inputs of a box in which H is affine.
-      finite: true if the controls are enumerated.
+      finite: True if the controls are enumerated.
     """
 
     exact: bool
@@ -49,7 +49,7 @@ class Rule:
 
     @property
     def jumps(self) -> bool:
-        """True if u* is no continuous function of the costate."""
+        """True if u* is not a continuous function of the costate."""
         return self.finite or bool(self.jumping)
 
 
@@ -64,16 +64,16 @@ def rule_of(problem: Problem, n: int) -> Rule:
     found = [dependence.dependence(function, *lengths, dtype=jnp.result_type(float)) for function in functions]
     if not all(each.separable_quadratic_in(inputs) for each in found):
         return Rule(exact=False)
-    # without a square in either function H is affine in that input: bang-bang
+    # if neither function has a square of the input, H is affine in it: bang-bang
     straight = tuple(j for j in inputs if not any(each.has_square((j,)) for each in found))
     # over a ball the minimum of an affine H, −r b/|b|, turns with b and does not jump
     return Rule(exact=True, jumping=straight if isinstance(problem.controls, Box) else ())
 
 
 def quadratic_with_noise(problem: Problem, n: int) -> tuple[bool, bool]:
-    """True if L + f·p + ½ tr(σσᵀ M) is a separable quadratic in u for all p and M; and true if the noise depends on u.
+    """True if L + f·p + ½ tr(σσᵀ M) is a separable quadratic in u for all p and M; and True if the noise depends on u.
 
-    Of a problem without opponent and without time.
+    For a problem without an opponent and without a time.
     """
     dtype = np.dtype(np.float64)
     found = dependence.influence(problem, n, dtype)
@@ -91,13 +91,13 @@ def _covariance(problem: Problem, x: State, u: Control) -> jax.Array:
 
 
 def hamiltonian(problem: Problem, t: Number, x: State, p: Costate, u: Control | None) -> Scalar:
-    """H(t, x, p, u) in cost units per unit time; ``x`` as the problem's functions want it."""
+    """H(t, x, p, u) in cost units per unit time; ``x`` in the form that the problem's functions take."""
     arguments = problem.arguments(x, u, t=t)
     return running_cost(problem, t, x, u) + jnp.asarray(problem.drift(*arguments), p.dtype) @ p
 
 
 def running_cost(problem: Problem, t: Number, x: State, u: Control | None) -> Scalar:
-    """L(t, x, u) in cost per unit time; zero where the problem has none."""
+    """L(t, x, u) in cost per unit time; zero if the problem has no cost."""
     return jnp.asarray(0.0 if problem.cost is None else problem.cost(*problem.arguments(x, u, t=t)), x.dtype)
 
 
@@ -118,7 +118,7 @@ def at_corner(problem: Problem, rule: Rule, t: Number, x: State, p: Costate, cor
     """The control with its jumping inputs as in ``corner``, and the others at their minimum."""
     if rule.finite or len(rule.jumping) == np.shape(corner)[-1]:
         return corner
-    # H is separable in its inputs, so that the others' minimum does not depend on the corner
+    # H is separable in its inputs, so the minimum of the others does not depend on the corner
     chosen = jnp.array([j in rule.jumping for j in range(np.shape(corner)[-1])])
     return jnp.where(chosen, corner, minimiser(problem, rule, t, x, p))
 
@@ -132,20 +132,20 @@ def minimiser(problem: Problem, rule: Rule, t: Number, x: State, p: Costate) -> 
 def least(
     admissible: AdmissibleSet, energy: Callable[[jax.Array], jax.Array], quadratic: bool, dtype: DType
 ) -> jax.Array:
-    """The admissible u, shape (m,), at which a function of u is least.
+    """The admissible u, shape (m,), that minimises a function of u.
 
     Args:
       admissible: the set.
-      energy: the function, of u (m,).
-      quadratic: true if it is a sum of quadratic polynomials of one input each, so that the formulas hold.
-      dtype: of u.
+      energy: the function of u (m,).
+      quadratic: True if it is a sum of quadratic polynomials of one input each, so that the formulas hold.
+      dtype: the type of u.
     """
     if isinstance(admissible, Finite):
         points = jnp.asarray(admissible.points, dtype)
         return points[jnp.argmin(jax.vmap(energy)(points))]
     if not quadratic:
         return _searched(admissible, energy, dtype)
-    # gradient and second derivatives at zero are its coefficients
+    # gradient and second derivatives at zero are the coefficients
     zero = jnp.zeros(admissible.dim, dtype)
     slope, square = jax.grad(energy)(zero), jnp.diagonal(jax.hessian(energy)(zero)) / 2
     if isinstance(admissible, Box):
@@ -157,7 +157,7 @@ def _in_box(lo: Control, hi: Control, slope: Control, square: Control) -> jax.Ar
     """The minimum of b·u + Σ c_j u_j², input by input."""
     convex = square > 0
     inner = jnp.clip(-slope / jnp.where(convex, 2 * square, 1), lo, hi)
-    # affine or concave: the better end, and the lower one where both are worth as much
+    # affine or concave: the better end, or the lower one if both are equally good
     end = jnp.where(slope * lo + square * lo * lo <= slope * hi + square * hi * hi, lo, hi)
     return jnp.where(convex, inner, end)
 
@@ -165,7 +165,7 @@ def _in_box(lo: Control, hi: Control, slope: Control, square: Control) -> jax.Ar
 def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], jax.Array], dtype: DType) -> jax.Array:
     """The minimum of H by samples, a pattern search, and Newton's method in the free inputs.
 
-    The last Newton step carries the derivative of the implicit function, which the search has not.
+    The last Newton step provides the derivative of the implicit function, which the search does not have.
     """
     assert isinstance(admissible, (Box, Ball))
     count = admissible.dim
@@ -173,7 +173,7 @@ def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], ja
     def project(action):
         u = jnp.stack(action)
         if isinstance(admissible, Ball):
-            # 1e-300 keeps the quotient finite at the centre, which stays where it is
+            # 1e-300 keeps the quotient finite at the centre, which does not move
             return list(u * jnp.minimum(1, admissible.radius / jnp.maximum(jnp.linalg.norm(u), 1e-300)))
         return list(jnp.clip(u, admissible.lo, admissible.hi))
 
@@ -182,18 +182,18 @@ def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], ja
 
     best = enumerate_actions(objective, jnp.asarray(samples(admissible, BUDGET), dtype), 1)
     u = jnp.stack(refine(objective, best, spacing(admissible, BUDGET), project, 1)[1])
-    # each starts from a number without a derivative, so that only the last step carries one
+    # each step starts from a number without a derivative, so only the last step has one
     for _ in range(3):
         u = jax.lax.stop_gradient(u)
         gradient, bend = jax.grad(energy)(u), jax.hessian(energy)(u)
-        # an input at its bound stays there: its row becomes the identity's with no right-hand side
+        # an input at its bound stays there: its row becomes a row of the identity with a zero right-hand side
         if isinstance(admissible, Ball):
             free = jnp.full(count, jnp.linalg.norm(u) < admissible.radius * (1 - 1e-6))
         else:
             room = 1e-6 * (admissible.hi - admissible.lo)
             free = (u > admissible.lo + room) & (u < admissible.hi - room)
         matrix = jnp.where(free[:, None] & free[None, :], bend, jnp.eye(count, dtype=dtype))
-        # elsewhere than at a minimum Newton's step may lead uphill; the search's answer stands then
+        # away from a minimum Newton's step may lead uphill; then the result of the search is kept
         convex = jnp.all(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) > 0)
         step = jnp.linalg.solve(matrix, jnp.where(free, gradient, 0))
         u = jnp.where(convex, jnp.stack(project(list(u - step))), u)

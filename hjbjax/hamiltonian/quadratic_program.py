@@ -7,7 +7,7 @@ In unit variables, v in [-1, 1]^m or |v| <= 1, the objective at a node is
 with one term per kink of a gain. A kink is convex or concave according to the sign of its jump.
 
 - Concave kinks: min(0, jump (a·v + c)) is the lesser of two affine functions, and minima commute. Every choice is
-  tried, and v need not be on the side that it stands for. A component with c concave kinks has c + 1 choices.
+  tried, even if v is then on the other side of the kink. A component with c concave kinks has c + 1 choices.
 - Convex kinks: jump max(a·v + c, 0) is the maximum of s (a·v + c) over 0 <= s <= jump, so that each choice is a convex
   program. A primal-dual interior-point method solves it for all nodes at once in 15 to 25 steps. Newton steps on the
   active set follow; they put inputs on their bounds and drifts on their kinks up to rounding.
@@ -16,13 +16,13 @@ Convexity gives a lower bound on every program, from its multipliers s and the g
 
     J >= l·v + v·Pv/2 + s·(Av + c) + min_w g·(w − v),    g = l + Pv + A's,
 
-so the distance of J(v) to the minimum is bounded at every node, whatever the iteration did.
+so the distance of J(v) to the minimum is bounded at every node, even if the iteration did not converge.
 
-Where P is not positive semidefinite, a diagonal D makes P + D so. The concave rest, −D v²/2, is replaced by a tangent
-at an end of its input, and both are tried, then by tangents at the best point: the answer may be a local minimum. The
-lower bound takes the chord, −D/2.
+If P is not positive semidefinite, a diagonal D makes P + D positive semidefinite. The concave rest, −D v²/2, is
+replaced by a tangent at an end of its input, and both ends are tried, then by tangents at the best point. The result
+may be a local minimum. The lower bound uses the chord, −D/2.
 
-Derivatives come from the optimality conditions with the active set held.
+Derivatives come from the optimality conditions with a fixed active set.
 """
 
 import functools
@@ -36,12 +36,12 @@ import numpy as np
 from hjbjax.problem.pytree import altered, pytree_dataclass
 
 STEPS = 40  # of the interior-point method; most nodes need 15, and the slowest of 100,000 random ones needed 27
-POLISH = 3  # Newton steps on the active set: its penalty contracts the error by the root of the rounding each
+POLISH = 3  # Newton steps on the active set: the penalty makes each multiply the error by the square root of rounding
 CLOSE = 16  # units of rounding of the largest coefficient at which a node has converged
-DESCENTS = 12  # convex programs with tangents at the best point, where a cost is not convex
-TANGENTS = 256  # choices of tangents and kinks that are tried at most
-PENALTY = 0.4  # ε^(−0.4) times the largest slope is a jump that stands for a constraint: 2e6 in float64
-NODES = 1 << 14  # nodes in one pass: they need about a hundred numbers each while they are solved
+DESCENTS = 12  # convex programs with tangents at the best point, if a cost is not convex
+TANGENTS = 256  # the largest number of choices of tangents and kinks to try
+PENALTY = 0.4  # a jump of ε^(−0.4) times the largest slope represents a constraint: 2e6 in float64
+NODES = 1 << 14  # nodes per pass, each of which needs about a hundred numbers
 
 
 @pytree_dataclass()
@@ -53,8 +53,8 @@ class Program:
       bend: P, (m, m, *nodes).
       rows: a_k, (K, m, *nodes).
       offsets: c_k, (K, *nodes).
-      jumps: (K, *nodes), of either sign; infinite where a kink is a constraint, a_k·v + c_k <= 0.
-      sides: (K, *nodes), 1 where a_k·v + c_k grows with the component that the kink belongs to, and −1 where it falls.
+      jumps: (K, *nodes), of either sign; infinite if the kink is a constraint, a_k·v + c_k <= 0.
+      sides: (K, *nodes), 1 if a_k·v + c_k increases with the component of the kink, −1 if it decreases.
     """
 
     slope: jax.Array
@@ -71,8 +71,8 @@ class Point(NamedTuple):
     Attributes:
       v: (m, ...).
       s: the multipliers of the kinks, (K, ...).
-      slack: what must not be negative, 1 + v and 1 − v, or (1 − |v|²)/2, and jump − s and s, (S, ...). They are
-        variables of their own: close to zero, 1 − v has no correct digits.
+      slack: the quantities that must not be negative, 1 + v and 1 − v, or (1 − |v|²)/2, and jump − s and s, (S, ...).
+        They are separate variables because 1 − v close to zero would have no correct digits.
       dual: their multipliers, (S, ...).
     """
 
@@ -83,7 +83,7 @@ class Point(NamedTuple):
 
 
 class Best(NamedTuple):
-    """The best point so far, J there, its concave kinks whose affine part it takes, and the least lower bound."""
+    """The best point so far, J there, the concave kinks whose affine part it uses, and the smallest lower bound."""
 
     point: Point
     value: jax.Array
@@ -96,11 +96,11 @@ def least(program: Program, axes: tuple[int, ...], *, ball: bool) -> tuple[jax.A
 
     Args:
       program: the coefficients.
-      axes: for every kink the component that it belongs to; the kinks of one component follow each other in order.
+      axes: the component of every kink; the kinks of one component are consecutive and in order.
       ball: True for |v| <= 1, False for [-1, 1]^m.
 
     Returns:
-      v, (m, *nodes), and a bound on J(v) minus the minimum, (*nodes), in the units of J; derivatives are those of v.
+      v, (m, *nodes), and a bound on J(v) minus the minimum, (*nodes), in the units of J; only v has derivatives.
     """
     shape = program.slope.shape[1:]
     flat = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[: leaf.ndim - len(shape)], -1), program)
@@ -132,17 +132,17 @@ def _least(axes: tuple[int, ...], ball: bool, program: Program) -> tuple[jax.Arr
 
 @_least.defjvp
 def _derivative(axes: tuple[int, ...], ball: bool, primals: tuple, tangents: tuple) -> tuple:
-    """dv by the optimality conditions: what is on a bound or at a kink stays there, the rest stays stationary."""
+    """dv by the optimality conditions: inputs on a bound or at a kink stay there, the others stay stationary."""
     (program,), (moves,) = primals, tangents
     scaled, size, width, met = _scaled(program, ball)
     best = _best(scaled, axes, ball)
     (v, s, slack, dual), stiff = best.point, _stiffness(best.value.dtype)
-    # moves in the units of the program, which are held
+    # the changes in the units of the program, which are constants
     slope, bend, rows, offsets = (
         moves.slope / size, moves.bend / size, moves.rows / width[:, None], moves.offsets / width,
     )  # fmt: skip
     jumps = jnp.where(jnp.isinf(program.jumps), 0, moves.jumps * width / size)
-    # a kink is met and convex, and has a multiplier; or it is an affine term or none, by its choice or everywhere
+    # a kink that is met and convex has a multiplier; any other kink is an affine term or zero, by choice or everywhere
     convex = met & (scaled.jumps > 0)
     affine = best.on | (~met & (program.offsets / width >= 1))
     whole = jnp.where(jnp.isinf(program.jumps), 0, program.jumps * width / size)
@@ -163,11 +163,11 @@ def _derivative(axes: tuple[int, ...], ball: bool, primals: tuple, tangents: tup
 
 
 def is_convex(bend: jax.Array) -> jax.Array:
-    """True at the nodes where a symmetric matrix (m, m, *nodes) is positive semidefinite up to rounding."""
+    """True at the nodes at which a symmetric matrix (m, m, *nodes) is positive semidefinite up to rounding."""
     size = jnp.max(jnp.abs(bend), (0, 1))
     rounding = CLOSE * jnp.finfo(bend.dtype).eps * size
     left, sound = bend, jnp.ones(bend.shape[2:], bool)
-    for j in range(len(bend)):  # the pivots of an elimination; where one is zero, so must be the rest of its row
+    for j in range(len(bend)):  # the pivots of an elimination; if one is zero, the rest of its row must be zero
         pivot, row = left[j, j], left[j]
         flat = pivot <= rounding
         sound &= (pivot >= -rounding) & (~flat | (jnp.max(jnp.abs(row), 0) <= jnp.sqrt(rounding * size) + rounding))
@@ -176,12 +176,12 @@ def is_convex(bend: jax.Array) -> jax.Array:
 
 
 def _scaled(program: Program, ball: bool) -> tuple[Program, jax.Array, jax.Array, jax.Array]:
-    """The program in units in which rows have the range one, and so has the largest slope; these units, and kinks met.
+    """The program in units in which the rows have range one and the largest slope is one, with these units.
 
-    A kink that no v meets is an affine term, or none. A convex one far away takes its place, with a row of zeros.
+    A kink that no v meets is an affine term or zero. A convex kink far away replaces it, with a row of zeros.
 
     Returns:
-      The program, its unit of J (*nodes), its units of the rows (K, *nodes), and the kinks that some v meets.
+      The program, its unit of J (*nodes), its units of the rows (K, *nodes), and a mask of the kinks that some v meets.
     """
     width = jnp.sqrt(jnp.sum(program.rows**2, 1)) if ball else jnp.sum(jnp.abs(program.rows), 1)
     width = jnp.where(width > 0, width, 1)
@@ -192,12 +192,12 @@ def _scaled(program: Program, ball: bool) -> tuple[Program, jax.Array, jax.Array
     met = (jnp.abs(offsets) < 1) & jnp.any(rows != 0, 1)
     size = jnp.maximum(jnp.max(jnp.abs(slope), 0), jnp.max(jnp.abs(program.bend), (0, 1)))
     size = jnp.maximum(size, jnp.max(jnp.where(met & (jumps < 0), -jumps, 0), 0, initial=0))
-    # a convex jump is at most a constraint, and may be huge next to an unreachable node: the rest sets the unit
+    # a convex jump is at most a constraint, and may be huge next to an unreachable node, so the rest sets the unit
     size = jnp.where(size > 0, size, jnp.max(jnp.where(met, jumps, 0), 0, initial=0))
     size = jnp.where(size > 0, size, 1)
     most = jnp.finfo(slope.dtype).eps ** -PENALTY
     jumps = jnp.where(endless, jnp.sign(program.jumps) * most, jnp.minimum(jumps / size, most))
-    # a jump of less than rounding changes nothing, and would be a multiplier without room
+    # a jump below rounding changes nothing, and its multiplier would have no room
     met &= jnp.abs(jumps) > jnp.finfo(slope.dtype).eps ** 2
     made = Program(
         slope / size, program.bend / size, jnp.where(met[:, None], rows, 0), jnp.where(met, offsets, -1),
@@ -227,7 +227,7 @@ def _best(program: Program, axes: tuple[int, ...], ball: bool) -> Best:
     def one(carry: tuple[jax.Array, Best]) -> tuple[jax.Array, Best]:
         number, best = carry
         on, ends = _choice(number, concave, program.sides, steep, axes)
-        # after the last choice, tangents at the best point so far
+        # after the last choice, use tangents at the best point so far
         on, ends = jnp.where(number < count, on, best.on), jnp.where(number < count, ends, best.point.v)
         affine = jnp.where(on, program.jumps, 0)
         known = program.slope + _back(program.rows, affine)
@@ -262,10 +262,10 @@ def _groups(axes: tuple[int, ...]) -> list[list[int]]:
 def _choice(
     number: jax.Array, concave: jax.Array, sides: jax.Array, steep: jax.Array, axes: tuple[int, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """The concave kinks whose affine part is taken, bool (K, ...), and the ends of the tangents, (m, ...), −1 or 1.
+    """The concave kinks whose affine part is used, bool (K, ...), and the ends of the tangents, (m, ...), −1 or 1.
 
-    A digit of ``number`` says how many of the concave kinks of one component are below the drift. Affine parts are
-    those of kinks below it that count upwards, and of kinks above it that count downwards.
+    A digit of ``number`` is the number of concave kinks of one component that are below the drift. The affine part is
+    used for kinks with side 1 below the drift, and for kinks with side −1 above it.
     """
     left = jnp.broadcast_to(number, concave.shape[1:])
     on: list[Any] = [None] * len(axes)
@@ -283,7 +283,7 @@ def _choice(
 
 
 def _shift(bend: jax.Array) -> jax.Array:
-    """A diagonal D (m, ...) with which P + D has dominant diagonals, so that it is positive semidefinite."""
+    """A diagonal D (m, ...) that makes P + D diagonally dominant and therefore positive semidefinite."""
     own = jnp.stack([bend[j, j] for j in range(len(bend))])
     return jnp.maximum(jnp.sum(jnp.abs(bend), 1) - jnp.abs(own) - own, 0)
 
@@ -291,7 +291,7 @@ def _shift(bend: jax.Array) -> jax.Array:
 def _solved(program: Program, ball: bool) -> Point:
     """The minimum of one convex program at every node.
 
-    A node takes interior-point steps until it has converged, then Newton steps on its active set, and stays.
+    A node makes interior-point steps until it has converged, then Newton steps on its active set, and then stops.
     """
     dtype = program.slope.dtype
     tolerance, stiff = CLOSE * jnp.finfo(dtype).eps, _stiffness(dtype)
@@ -302,7 +302,7 @@ def _solved(program: Program, ball: bool) -> Point:
         residuals = _residuals(program, point, ball)
         mean = jnp.mean(slack * dual, 0)
         error = functools.reduce(jnp.maximum, [jnp.max(jnp.abs(each), 0, initial=0) for each in residuals])
-        # residuals of rounding stay where weights are large; the steps on the active set take them away
+        # large weights leave residuals of rounding, which the steps on the active set remove
         close = jnp.where(mean < 0.01 * tolerance, 0, jnp.maximum(error, len(slack) * mean)) <= tolerance
         ends = (left == POLISH) & (close | (number >= STEPS))
         settled, active = ends | (left < POLISH), dual > slack
@@ -311,11 +311,11 @@ def _solved(program: Program, ball: bool) -> Point:
         target = jnp.where(settled, jnp.where(active, dual - stiff * slack, 0), centring * mean / slack)
         change = _newton(program, point, residuals, weight, target - dual, ball)
         length = jnp.where(settled, 1, jnp.minimum(1, 0.99 * _longest(point, change)))
-        # where weights overflow a step is no number: the interior-point method ends there
+        # if weights overflow, the step is not finite and the interior-point method ends
         sound = jnp.isfinite(length + jnp.sum(change.v, 0) + jnp.sum(change.dual, 0))
         moved = jax.tree.map(lambda old, new: jnp.where(sound & (left > 0), old + length * new, old), point, change)
         inside = jax.tree.map(lambda now, before: jnp.where(sound | settled, before, now), point, inside)
-        # the next step aims the closer to the boundary the longer this one was
+        # after a long step the next one aims closer to the boundary
         centring = jnp.clip((1 - length) ** 2, 0.01, 0.8)
         return _Steps(number + 1, moved, centring, jnp.where(sound, jnp.maximum(left - settled, 0), 0), inside)
 
@@ -324,13 +324,13 @@ def _solved(program: Program, ball: bool) -> Point:
                    jnp.full(start.v.shape[1:], POLISH, jnp.int32), start)  # fmt: skip
     last = jax.lax.while_loop(lambda carry: jnp.any(carry.left > 0), step, first)
     polished, inside = (_within(each, program.jumps, ball) for each in (last.point, last.inside))
-    # a wrong active set makes a worse point: then the interior one stays
+    # a wrong active set gives a worse point; then the interior point is kept
     better = _value(program, polished.v) <= _value(program, inside.v) + tolerance
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), polished, inside)
 
 
 class _Steps(NamedTuple):
-    """The state of ``_solved``: steps taken, the point, how central the next step is, polishing steps left, and the
+    """The state of ``_solved``: steps made, the point, the centring of the next step, polishing steps left, and the
     last interior point."""
 
     number: jax.Array
@@ -362,7 +362,7 @@ def _start(program: Program, ball: bool) -> Point:
         slack, dual = [one[:1] / 2], [1 + jnp.sqrt(jnp.sum(g * g, 0, keepdims=True))]
     else:
         slack, dual = [one, one], [jnp.maximum(g, 0) + 1, jnp.maximum(-g, 0) + 1]
-    # all products of slack and multiplier are of the same size, also where a jump is huge
+    # all products of slack and multiplier are of the same size, even if a jump is huge
     above = (jnp.maximum(program.offsets, 0) + 1) / jnp.maximum(program.jumps - s, 1)
     below = jnp.maximum(-program.offsets, 0) + 1
     return Point(
@@ -371,10 +371,10 @@ def _start(program: Program, ball: bool) -> Point:
 
 
 def _residuals(program: Program, point: Point, ball: bool) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """What is not zero: the Lagrangian's slope in v, (m, ...), and two conditions on slacks.
+    """The nonzero residuals: the Lagrangian's slope in v, (m, ...), and two conditions on slacks.
 
-    The second is a·v + c less its positive and its negative part, (K, ...); the third, (1, ...), is the slack of the
-    ball. All others are affine, so that every step keeps them.
+    The second is a·v + c minus its positive and its negative part, (K, ...). The third, (1, ...), is the slack of the
+    ball. All other conditions are affine, so every step satisfies them.
     """
     (v, s, slack, dual), m, kinks = point, len(point.v), len(point.s)
     pull = program.slope + _times(program.bend, v) + _back(program.rows, s)
@@ -387,12 +387,12 @@ def _residuals(program: Program, point: Point, ball: bool) -> tuple[jax.Array, j
 def _newton(
     program: Program, point: Point, residuals: Sequence[jax.Array], weight: jax.Array, aim: jax.Array, ball: bool
 ) -> Point:
-    """The move with Δdual = aim − weight · Δslack that takes the residuals away, to first order."""
+    """The move with Δdual = aim − weight · Δslack that removes the residuals to first order."""
     v, m, kinks, bars = point.v, len(point.v), len(point.s), len(point.dual) - 2 * len(point.s)
     (pull, beside, bar), root = residuals, 1 / _stiffness(point.v.dtype)
     above, below = slice(bars, bars + kinks), slice(bars + kinks, None)
     both = weight[above] + weight[below]
-    # at a kink of the active set neither weight acts: its drift is held by a penalty
+    # at a kink of the active set neither weight acts: a penalty holds its drift
     soft = 1 / jnp.where(both > 0, both, root)
     beyond = beside - aim[above] + aim[below]
     matrix = program.bend + jnp.sum(program.rows[:, :, None] * program.rows[:, None] * soft[:, None, None], 0)
@@ -404,7 +404,7 @@ def _newton(
     else:
         matrix = matrix + eye * (weight[:m] + weight[m : 2 * m])[:, None]
         right = right + aim[:m] - aim[m : 2 * m]
-    # so that rounding makes no pivot negative, nor zero where nothing bends; residuals are taken anew at every step
+    # keeps pivots positive despite rounding, and nonzero if nothing bends; residuals are recomputed at every step
     matrix = matrix + eye * root**2 * (1 + 4 * matrix)
     dv = jax.lax.custom_linear_solve(
         lambda move: _times(matrix, move), right, lambda _, known: _eliminated(matrix, known), symmetric=True
@@ -416,7 +416,7 @@ def _newton(
 
 
 def _longest(point: Point, change: Point) -> jax.Array:
-    """The longest step to where a slack or a multiplier becomes zero."""
+    """The longest step that keeps slacks and multipliers nonnegative."""
     limits = [
         jnp.min(jnp.where(move < 0, -start / jnp.where(move < 0, move, -1), jnp.inf), 0)
         for start, move in ((point.slack, change.slack), (point.dual, change.dual))
@@ -425,7 +425,7 @@ def _longest(point: Point, change: Point) -> jax.Array:
 
 
 def _stiffness(dtype: Any) -> float:
-    """The penalty by which an active set is held, next to coefficients of one."""
+    """The penalty that holds an active set, relative to coefficients of one."""
     return float(jnp.finfo(dtype).eps) ** -0.5
 
 

@@ -1,8 +1,8 @@
 """Minimising (or maximising) a function of one action at every node, over each kind of admissible set.
 
-An action is a list of per-node scalars, one an input. Every routine takes an ``objective(action)`` that
-returns a pair (value, extra): the value at every node, and whatever is worth keeping of how it came about
-(the opponent's answer). ``sign`` is +1 to minimise and −1 to maximise.
+An action is a list of per-node scalars, one per input. Every routine takes an ``objective(action)`` that returns a pair
+(value, extra): the value at every node, and data to keep with it (the opponent's answer). ``sign`` is +1 to minimise
+and −1 to maximise.
 """
 
 import functools
@@ -20,16 +20,16 @@ Action = list
 Objective = Callable[[Action], tuple[jax.Array, list]]
 Best: TypeAlias = tuple[jax.Array, Action, list]  # the best value so far, the action there, and the extra there
 
-UNROLL = 80  # actions of a finite set in one fused kernel; with more, it compiles slowly and runs slowly
-CHUNK = 20  # evaluations in one step of the scan that takes over
-WRITTEN = 2  # evaluations in one step of a loop that searches a continuum: with 80, programs take three times as long
-# to compile and nothing runs faster; with 4, the search of a long function (``zoo.merton``) takes twice as long
-TURNED = 2  # rounds of each length in turned directions
-REFINEMENTS = 24  # halvings of the sample spacing: 2⁻²⁴ of it is below the rounding of float32
+UNROLL = 80  # largest finite set whose evaluations share one fused kernel; a larger kernel compiles and runs slowly
+CHUNK = 20  # evaluations per step of the scan used for larger sets
+WRITTEN = 2  # evaluations per step of a loop that searches a continuous set: with 80, programs take three times as long
+# to compile and run no faster; with 4, the search of a long function (``zoo.merton``) takes twice as long
+TURNED = 2  # rounds of each length in rotated directions
+REFINEMENTS = 24  # halvings of the sample spacing: a factor of 2⁻²⁴ is below the rounding of float32
 
 
 def better(sign: int, challenger: PerNode, incumbent: PerNode) -> PerNode:
-    """The nodes where ``challenger`` is strictly better, bool; NaN never is."""
+    """The nodes where ``challenger`` is strictly better, bool; False where it is NaN."""
     return challenger < incumbent if sign > 0 else challenger > incumbent
 
 
@@ -41,14 +41,14 @@ def pick(condition: PerNode, first: T, second: T) -> T:
 def enumerate_actions(
     objective: Objective, points: jax.Array, sign: int, *, weight: int = 1, most: int = UNROLL
 ) -> Best:
-    """The best of the rows of ``points``, in order; the first of equals wins.
+    """The best of the rows of ``points``, in order; the first of several equally good rows wins.
 
     Args:
       objective: see the module.
       points: shape (K, m).
       sign: +1 to minimise, −1 to maximise.
-      weight: how many evaluations one call of ``objective`` stands for.
-      most: evaluations that may be written out.
+      weight: the number of evaluations that one call of ``objective`` counts as.
+      most: the largest number of evaluations to write out.
 
     Returns:
       The best value, the action there, and the extra there.
@@ -57,12 +57,12 @@ def enumerate_actions(
     if count * weight <= most:
         return best_of(objective, [[points[k, j] for j in range(inputs)] for k in range(count)], sign, None)
     chunk = max(1, min(CHUNK, most) // weight)
-    padded = -(-count // chunk) * chunk  # the last row again, which is never strictly better than itself
+    padded = -(-count // chunk) * chunk  # repeats of the last row, which are never strictly better than it
     rows = jnp.concatenate([points, jnp.broadcast_to(points[-1:], (padded - count, inputs))])
-    # shapes alone: evaluated once more in front of the loop, the objective would be compiled once more
+    # only shapes: evaluating the objective before the loop would compile it once more
     value, extra = jax.eval_shape(lambda row: objective(list(row)), points[0])
     everywhere = functools.partial(jnp.full, value.shape, dtype=value.dtype)
-    # the worst that there is: whatever comes first wins
+    # the worst possible value, so that the first evaluation wins
     best = everywhere(sign * jnp.inf), [everywhere(points[0, j]) for j in range(inputs)], [everywhere(0) for _ in extra]
 
     def step(best, block):
@@ -74,34 +74,34 @@ def enumerate_actions(
 def optimum(
     function: Callable[[Action], jax.Array], points: jax.Array, sign: int, *, weight: int = 1, most: int = UNROLL
 ) -> jax.Array:
-    """The best value over the rows of ``points`` alone, for half the work of a search that keeps the action.
+    """The best value over the rows of ``points``, without the action, in half the time of a search that keeps it.
 
     Args:
-      function: the value at every node, of an action.
+      function: the value at every node, for an action.
       points: shape (K, m).
       sign: +1 to minimise, −1 to maximise.
-      weight: how many evaluations one call of ``function`` stands for.
-      most: evaluations that may be written out.
+      weight: the number of evaluations that one call of ``function`` counts as.
+      most: the largest number of evaluations to write out.
     """
     count, inputs = np.shape(points)
     if count * weight > most:
         return enumerate_actions(lambda action: (function(action), []), points, sign, weight=weight, most=most)[0]
     best, *others = (function([points[k, j] for j in range(inputs)]) for k in range(count))
     total = best
-    for value in others:  # a comparison and a select are one instruction, and min, which hands on a NaN, is five
+    for value in others:  # compare and select are one instruction; min, which propagates NaN, takes five
         best, total = jnp.where(better(sign, value, best), value, best), total + value
-    return jnp.where(jnp.isnan(total), total, best)  # of a NaN among them the sum is one
+    return jnp.where(jnp.isnan(total), total, best)  # the sum is NaN if any value is NaN
 
 
 def best_of(objective: Objective, actions: Sequence[Action], sign: int, best: Best | None) -> Best:
-    """The best of some actions and of ``best``, as ``enumerate_actions`` returns it; None where there is none yet."""
+    """The best of some actions and of ``best``, as returned by ``enumerate_actions``, or None at the beginning."""
     for action in actions:
         value, extra = objective(action)
         chosen = ([jnp.asarray(entry, value.dtype) for entry in action], extra)
         if best is None:
             best = (value, *chosen)
             continue
-        wins = better(sign, value, best[0]) | jnp.isnan(value)  # so that the action found has a NaN, too
+        wins = better(sign, value, best[0]) | jnp.isnan(value)  # a NaN must not be lost
         best = pick(wins, (value, *chosen), best)
     assert best is not None
     return best
@@ -116,20 +116,20 @@ def refine(
     *,
     weight: int = 1,
 ) -> Best:
-    """Pattern search around the best sample: one input at a time and in turned directions, halving the step.
+    """Pattern search around the best sample, along single inputs and in rotated directions, halving the step.
 
     Args:
       objective: see the module.
-      best: what ``enumerate_actions`` returned.
-      spacing: distance between neighbouring samples, one number an input.
+      best: the result of ``enumerate_actions``.
+      spacing: distance between neighbouring samples, one number per input.
       project: maps an action to the nearest admissible one.
       sign: +1 to minimise, −1 to maximise.
-      weight: how many evaluations one call of ``objective`` stands for; where it is a search of its own, the moves of
-        a round are made one by one in a loop, since each one written out is compiled apart.
+      weight: the number of evaluations that one call of ``objective`` counts as. If it is a search too, the moves of a
+        round are made one by one in a loop, since each move that is written out is compiled separately.
     """
     value, action, extra = best
     dtype, shape = value.dtype, value.shape
-    # the carry of a loop has fixed shapes: actions that are one number for all nodes become arrays first
+    # the carry of a loop has fixed shapes, so actions that are one number for all nodes become arrays first
     best = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, dtype), shape), (value, action, extra))
 
     table = jnp.asarray(_moves(len(action)), dtype)
@@ -150,9 +150,9 @@ def refine(
 
 
 def _moves(inputs: int) -> np.ndarray:
-    """The moves of every round, (rounds, moves, inputs), in distances between two samples, from half of one downwards.
+    """The moves of every round, (rounds, moves, inputs), in units of the sample spacing, from one half downwards.
 
-    One input at a time stops where a kink runs across several of them: turned directions find the way along it.
+    Moves along single inputs get stuck at a kink that runs across several inputs; rotated directions can follow it.
     """
     turns = np.random.default_rng(0).normal(size=(REFINEMENTS * TURNED, inputs, inputs))
     directions = [np.eye(inputs)[None].repeat(REFINEMENTS, 0)[:, None]]

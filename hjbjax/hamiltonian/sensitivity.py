@@ -1,15 +1,15 @@
 """Derivatives of the optimal actions, by the implicit function theorem.
 
-Where the optimum over an input z is found in closed form, its formula is differentiated as it stands: ends of the set,
-kinks of the upwinding and stationary points all move as they do there. Where it was searched, and in a game whose
-players meet, the inputs that are free at a node satisfy ∂H/∂z = 0, so that
+If the optimum over an input z has a closed form, the formula is differentiated: ends of the set, kinks of the upwinding
+and stationary points all move as in the formula. If it was searched, and in a game with coupled players, the inputs
+that are free at a node satisfy ∂H/∂z = 0, so that
 
     dz = −(∂²H/∂z²)⁻¹ d(∂H/∂z),
 
-for both players at once. An input is not free where an end of its box or a kink of H holds it: it moves with the end,
-and at a kink of the upwinding, f = 0 or with central differences |f| = a/h, so that f stays there. On the rim of a
-ball, |z| = R, a multiplier λ joins, with ∂H/∂z + λ z = 0. Among finitely many actions nothing moves, nor where H does
-not depend on the action to second order.
+for both players at once. An input is not free if an end of its box or a kink of H holds it. At an end it moves with the
+end. At a kink of the upwinding, f = 0 or with central differences |f| = a/h, it moves so that f stays at the kink. On
+the rim of a ball, |z| = R, there is also a multiplier λ with ∂H/∂z + λ z = 0. Actions from a finite set do not move,
+nor does an action on which H does not depend to second order.
 """
 
 import dataclasses
@@ -30,27 +30,28 @@ from hjbjax.problem import sets
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Field
 
-# A minimum found by comparing values is off by the root of their rounding, times a few: so many times ε^{1/4} is 5e-4
-# of the distance between two samples in float64, and 7e-2 in float32. What a Newton step would move further is held.
+# A minimum found by comparing values is off by about the square root of their rounding error. This number
+# times ε^{1/4} is 5e-4 of the sample spacing in float64, and 7e-2 in float32. An input that a Newton step would move
+# further counts as held.
 STATIONARY = 4
 
-Row: TypeAlias = tuple[dict[int, Any], Any]  # of a linear system at every node: entries by column, and the right side
+Row: TypeAlias = tuple[dict[int, Any], Any]  # of a linear system at every node: entries by column, and right-hand side
 
 
 @dataclasses.dataclass(frozen=True)
 class Input:
-    """One input of a player whose actions are a continuum: ``mine`` says whether it is the control's."""
+    """One input of a player with a continuous set of actions."""
 
     player: Player
     index: int
 
     @property
     def mine(self) -> bool:
-        """Whether the control sets it, and not the disturbance."""
+        """True for an input of the control, False for one of the disturbance."""
         return self.player.sign > 0
 
     def entry(self, u: Action, d: Action) -> Any:
-        """Its value at the nodes."""
+        """The value of the input at the nodes."""
         return (u if self.mine else d)[self.index]
 
     def moved(self, u: Action, d: Action, step: Any) -> tuple[Action, Action]:
@@ -65,7 +66,7 @@ class Input:
         return jax.jvp(lambda step: function(*self.moved(u, d, step)), (zero,), (jnp.ones_like(zero),))[1]
 
     def close(self) -> Any:
-        """A distance that is rounding of a minimum found by comparing values, in its own units."""
+        """A distance within the rounding error of a minimum found by comparing values, in the units of the input."""
         assert self.player.admissible is not None
         width = sets.spacing(self.player.admissible, SAMPLES)[self.index]
         return jax.lax.stop_gradient(STATIONARY * jnp.finfo(jnp.result_type(width)).eps ** 0.25 * width)
@@ -73,7 +74,7 @@ class Input:
 
 @dataclasses.dataclass(frozen=True)
 class Optimum:
-    """An optimum at every node: the Hamiltonian as it may be differentiated, the same frozen, and the actions found."""
+    """An optimum at every node: the Hamiltonian to differentiate, the same Hamiltonian frozen, and the actions."""
 
     moving: DiscreteHamiltonian
     frozen: DiscreteHamiltonian
@@ -82,10 +83,10 @@ class Optimum:
 
 
 def actions(on: Discretisation, value: Field, lost: jax.Array | None, u: Action, d: Action) -> tuple[Action, Action]:
-    """The optimal actions as differentiable functions of a value and of all that ``on`` holds.
+    """The optimal actions as differentiable functions of a value and of all numbers in ``on``.
 
-    Their numbers may differ from ``u`` and ``d`` by rounding, and where several actions are worth the same: what is
-    meant are the derivatives.
+    The result is meant for its derivatives. Its numbers may differ from ``u`` and ``d`` by rounding, and if several
+    actions are equally good.
 
     Args:
       on: the problem on its grid.
@@ -94,25 +95,25 @@ def actions(on: Discretisation, value: Field, lost: jax.Array | None, u: Action,
       u, d: the actions that were found, each input (*grid).
     """
     players = players_of(on)
-    # what says which branch holds is frozen: to first order no node goes over to another one
+    # the choice of branches is frozen: to first order no node changes its branch
     kept, u, d = jax.lax.stop_gradient(((on, value), list(u), list(d)))
     at = Optimum(discrete.around(on, value, lost), discrete.around(*kept, lost), u, d)
     control, disturbance = players.control, players.disturbance
-    # min max of a function that is no sum: where one moves the other's optimum moves, so both are solved for at once
+    # for a coupled min max each optimum moves with the other, so solve for both at once
     if disturbance.admissible is not None and not players.decoupled:
         return _implicit(at, [*_inputs(control), *_inputs(disturbance)])
     return _alone(at, control, lambda mine: (mine, d))[0], _alone(at, disturbance, lambda mine: (u, mine))[1]
 
 
 def _alone(at: Optimum, player: Player, join: Callable) -> tuple[Action, Action]:
-    """Both actions with the derivatives of a player's who need not know the other's."""
+    """Both actions with the derivatives of one player, whose optimum does not depend on the other's action."""
     if player.exact:
         return join(optimum.best_response(at.moving, player, join)[1])
     return _implicit(at, _inputs(player))
 
 
 def _inputs(player: Player) -> list[Input]:
-    """The inputs that may move by small steps."""
+    """The inputs that can move by small steps."""
     if isinstance(player.admissible, (Box, Ball)):
         return [Input(player, j) for j in range(player.admissible.dim)]
     return []
@@ -127,12 +128,12 @@ def _implicit(at: Optimum, inputs: Sequence[Input]) -> tuple[Action, Action]:
     bends = [[b.slope(functools.partial(a.slope, at.frozen.at), u, d) for b in inputs] for a in inputs]
     steps = _solved(_rows(at, inputs, slopes, bends))
     for each, step in zip(inputs, steps, strict=False):  # the multipliers come last
-        u, d = each.moved(u, d, step - jax.lax.stop_gradient(step))  # the numbers as they were found
+        u, d = each.moved(u, d, step - jax.lax.stop_gradient(step))  # keeps the numbers as they were found
     return u, d
 
 
 def _rows(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], bends: Sequence[Sequence[Field]]) -> list[Row]:
-    """The linear system of small steps: a row an input, and one more a ball for its multiplier."""
+    """The linear system of small steps: one row per input, and one more per ball for its multiplier."""
     rims = {mine: _rim(at, inputs, slopes, mine) for mine in (True, False) if _in_ball(inputs, mine)}
     columns, ends, kinked = [], [], []
     for a, each in enumerate(inputs):
@@ -146,7 +147,7 @@ def _rows(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], bends: 
         kinked.append(~ends[a][0] & ~(jnp.abs(slope) < each.close() * jnp.abs(row[a])))  # also where H is flat
     kinks = _kinks(at, inputs, kinked)
     held = [ended | unsettled for (ended, _), unsettled in zip(ends, kinked, strict=True)]
-    for rim in rims.values():  # beside an input that a kink holds the rim holds the others
+    for rim in rims.values():  # if a kink holds an input, the rim determines the others
         beside = rim.on & functools.reduce(jnp.logical_or, (kinks.hold(k) for k in rim.entries))
         held = [each & ~beside if k in rim.entries else each for k, each in enumerate(held)]
     rows = [
@@ -156,7 +157,7 @@ def _rows(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], bends: 
         for a, (row, (_, end), g) in enumerate(zip(columns, ends, slopes, strict=True))
     ]
     for place, rim in enumerate(rims.values(), len(inputs)):
-        # the rim says nothing of inputs that are all held
+        # the rim says nothing about inputs that are all held
         free = (~held[k] & ~kinks.hold(k) & (abs(entry) > 0) for k, entry in rim.entries.items())
         on = rim.on & functools.reduce(jnp.logical_or, free)
         around = {k: jnp.where(on, entry, 0) for k, entry in rim.entries.items()} | {place: jnp.where(on, 0.0, 1.0)}
@@ -165,7 +166,7 @@ def _rows(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], bends: 
 
 
 def _end(each: Input, entry: Any) -> tuple[Any, Any]:
-    """The nodes where an end of its box holds an input, and the end there."""
+    """The nodes at which an end of its box holds an input, and the end."""
     admissible = each.player.admissible
     if not isinstance(admissible, Box):
         return jnp.zeros(jnp.shape(entry), bool), jnp.zeros_like(entry)
@@ -176,7 +177,7 @@ def _end(each: Input, entry: Any) -> tuple[Any, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Rim:
-    """Where an action is on the rim of its ball, the multiplier there, and the action's entries by input."""
+    """The nodes at which an action is on the rim of its ball, the multiplier, and the action's entries by input."""
 
     on: Any
     multiplier: Any
@@ -202,18 +203,18 @@ def _rim(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], mine: bo
 
 @dataclasses.dataclass(frozen=True)
 class Kinks:
-    """Kinks of the upwinding: how far beyond them drifts are, what that is in every input, and where one holds it."""
+    """Kinks of the upwinding: the distance of drifts beyond them, its slope in each input, and the inputs they hold."""
 
     passed: Sequence[Any]  # f, or f ∓ a/h, with derivatives
-    slopes: Sequence[Sequence[Any]]  # its ∂/∂z, a row a kink
-    holds: Sequence[Sequence[Any]]  # a row an input; a kink holds one input of a node at most
+    slopes: Sequence[Sequence[Any]]  # the ∂/∂z of ``passed``, one row per kink
+    holds: Sequence[Sequence[Any]]  # one row per input; a kink holds at most one input of a node
 
     def hold(self, a: int) -> Any:
-        """The nodes where some kink holds an input, bool."""
+        """The nodes at which some kink holds an input, bool."""
         return functools.reduce(jnp.logical_or, self.holds[a], jnp.zeros((), bool))
 
     def followed(self, a: int, row: Row) -> Row:
-        """The row of an input, which moves so that the drift stays at the kink where one holds it."""
+        """The row of an input, replaced where a kink holds it so that the drift stays at the kink."""
         columns, side = row
         for beyond, slopes, here in zip(self.passed, self.slopes, self.holds[a], strict=True):
             columns = {b: jnp.where(here, slopes[b] if b < len(slopes) else 0, value) for b, value in columns.items()}
@@ -222,9 +223,9 @@ class Kinks:
 
 
 def _kinks(at: Optimum, inputs: Sequence[Input], kinked: Sequence[Any]) -> Kinks:
-    """The kinks of the components that an input drives, of each player by itself where they are upwinded apart."""
+    """The kinks of the components that an input drives, for each player separately if their drifts are."""
     driven = {i for each in inputs for i in each.player.driven[each.index]}
-    if callable(at.moving.on.problem.noise):  # a may move with an input that does not drive f
+    if callable(at.moving.on.problem.noise):  # a may change with an input that does not drive f
         driven = set(range(at.moving.on.grid.ndim))
     kept = _passed(at.moving, driven, at.u, at.d)
 
@@ -244,10 +245,10 @@ def _kinks(at: Optimum, inputs: Sequence[Input], kinked: Sequence[Any]) -> Kinks
 
 
 def _passed(hamiltonian: DiscreteHamiltonian, axes: Collection[int], u: Action, d: Action) -> list[Any]:
-    """By how much the drift along some axes is beyond each of the kinks of its gain, (*grid) each."""
+    """The distance of the drift along some axes beyond each of the kinks of its gain, (*grid) each."""
     on, found = hamiltonian.on, []
     for number, part in enumerate(on.drifts(u, d)):
-        noise = {} if number else on.diffusion(u, d)  # where drifts are upwinded apart, it goes with the first
+        noise = {} if number else on.diffusion(u, d)  # if drifts are upwinded separately, it belongs to the first
         for axis in sorted(axes):
             left = correlated_noise.along_axis(noise, on.grid, axis)
             found += [part[axis] - kink for kink in hamiltonian.kinks(axis, left)[0]]
@@ -258,7 +259,7 @@ def _solved(rows: Sequence[Row]) -> list[Any]:
     """The unknowns of a small linear system at every node."""
     right = jnp.stack([side for _, side in rows], axis=-1)
     entries = [[columns.get(b, 0.0) for b in range(len(rows))] for columns, _ in rows]
-    # a few unknowns at each of many nodes: batched elimination, and a division where there is one
+    # a few unknowns at each of many nodes: batched elimination, or a division for one unknown
     matrix = jnp.stack(
         [jnp.stack([jnp.broadcast_to(entry, right.shape[:-1]) for entry in row], axis=-1) for row in entries], axis=-2
     )

@@ -1,5 +1,5 @@
-"""The question: what is asked, and on which nodes.
+"""The problem and its grid: the input of a solve.
 
-Read ``problem`` and ``sets`` first, then ``grid`` with ``stretching``. ``arguments`` refuses what makes no sense;
-``pytree`` makes dataclasses that JAX looks through. ``parts`` is about grids that are divided over many devices.
+Read ``problem`` and ``sets`` first, then ``grid`` with ``stretching`` and ``ends``. ``arguments`` checks arguments,
+``pytree`` makes dataclasses that are pytrees, and ``parts`` divides a grid over several devices.
 """

@@ -1,7 +1,7 @@
-"""Checks of arguments, said once: numbers, counts, kinds of choices, and what a Grid is given.
+"""Checks of arguments shared by the package: numbers, counts, choices, and the arguments of a Grid.
 
-Each takes the name of the argument as the user knows it, as in ``"solve: tol"``, and refuses with that name, the value
-and what is wanted. Tracers pass: inside a JAX transformation no value can be looked at.
+Each check takes the name of the argument as the user knows it, as in ``"solve: tol"``. Its message has that name, the
+value and the wanted value. Tracers pass, because inside a JAX transformation values are unknown.
 """
 
 import contextlib
@@ -23,30 +23,30 @@ from hjbjax.problem.types import Array, DType, Key
 
 T = TypeVar("T")
 
-COINCIDING = 16  # units in the last place of a coordinate, of which a spacing must be more
+COINCIDING = 16  # units in the last place of a coordinate; every spacing must be larger
 INDEXABLE = 2**31  # nodes that 32-bit indices can number
 NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
-SHOWN = 80  # characters of a refused value that are quoted
-EDGES = ("projected", "constrained", "open", "linear")  # ends without numbers: static, hashable, saved as they are
-Ends = tuple[str, str] | None  # of an axis: the kinds of its lower and its upper end; none where it is periodic
+SHOWN = 80  # characters of a refused value to quote
+EDGES = ("projected", "constrained", "open", "linear")  # ends without numbers: static, hashable, saved as names
+Ends = tuple[str, str] | None  # the kinds of the lower and the upper end of an axis; None for a periodic axis
 
 
 def positive(value: T, name: str, unit: str = "", *, most: float = math.inf, endless: bool = False) -> T:
-    """The value, unless it is not one finite number above zero.
+    """The value, after checking that it is one finite number above zero.
 
     Args:
-      value: what was given.
+      value: the user's value.
       name: the argument.
-      unit: what the number counts, as in "in units of time".
-      most: the largest number that is admissible.
-      endless: whether infinity is admissible, too.
+      unit: the unit of the number, as in "in units of time".
+      most: the largest admissible number.
+      endless: True if infinity is admissible.
 
     Raises:
-      ValueError: zero, negative, NaN, infinite, a truth value, an array, no number at all.
+      ValueError: zero, negative, NaN, infinite, a boolean, an array, or not a number.
     """
     if is_traced(value) or (endless and is_number(value) and value == math.inf):
         return value
-    # in NumPy: inside ``jit`` a comparison with a JAX number is traced, and has no truth value
+    # in NumPy: inside ``jit`` a comparison with a JAX number is traced and has no truth value
     number: Any = np.asarray(value) if isinstance(value, jax.Array) else value
     if not (is_number(value) and math.isfinite(number) and 0 < number <= most):
         wanted = "a finite number > 0" if most == math.inf else f"a number > 0 and at most {most:g}"
@@ -55,12 +55,12 @@ def positive(value: T, name: str, unit: str = "", *, most: float = math.inf, end
 
 
 def count(value: object, name: str, least: int = 1) -> int:
-    """The value, unless it is not an integer of at least ``least``.
+    """The value, after checking that it is an integer of at least ``least``.
 
     Raises:
-      ValueError: too small, a float, a truth value, no number at all.
+      ValueError: too small, a float, a boolean, or not a number.
     """
-    # True is an integer to Python, and three steps given as 3.0 are more likely a slip than a count
+    # Python counts True as an integer, and 3.0 is more likely a mistake than a count
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
         wanted = "a positive integer" if least == 1 else f"an integer of at least {least}"
         raise ValueError(f"{name} = {shown(value)}; wanted {wanted}")
@@ -68,10 +68,10 @@ def count(value: object, name: str, least: int = 1) -> int:
 
 
 def random_key(given: Any, name: str, *, batch: bool = False) -> Key:
-    """The random key, that of a seed, or an array of keys where a batch is admissible.
+    """The random key, the key of a seed, or an array of keys if ``batch``.
 
     Raises:
-      ValueError: no key and no seed, a seed beyond 64 bits, more keys than are admissible.
+      ValueError: neither a key nor a seed, a seed beyond 64 bits, or more keys than are admissible.
     """
     key = given
     if isinstance(given, (int, np.integer)) and not isinstance(given, bool):
@@ -90,8 +90,8 @@ def random_key(given: Any, name: str, *, batch: bool = False) -> Key:
 
 
 def as_dtype(dtype: DType | None) -> np.dtype:
-    """The floating-point type that a user asked for; None is float64."""
-    # np.dtype reads many spellings, and raises TypeError at others
+    """The floating-point type that the user chose; float64 by default."""
+    # np.dtype accepts many spellings, and raises TypeError for others
     for kind in (np.dtype(np.float64), np.dtype(np.float32)):
         with contextlib.suppress(TypeError):
             if kind == (np.float64 if dtype is None else np.dtype(dtype)):
@@ -100,11 +100,11 @@ def as_dtype(dtype: DType | None) -> np.dtype:
 
 
 def traced_dtype(dtype: DType | None, name: str) -> np.dtype:
-    """The floating-point type inside a JAX transformation; None is that of ``float`` there."""
+    """The floating-point type inside a JAX transformation; JAX's default float by default."""
     if dtype is None:
         return np.dtype(jnp.result_type(float))
     kind = as_dtype(dtype)
-    if kind == np.float64 and kind != np.dtype(jnp.result_type(float)):  # JAX would go on in float32, and warn
+    if kind == np.float64 and kind != np.dtype(jnp.result_type(float)):  # JAX would continue in float32 with a warning
         raise ValueError(
             f"{name}: got dtype={dtype!r} inside jit, vmap or grad, where JAX is set to 32 bits and a type cannot be "
             "changed; put `with jax.enable_x64(True):` around the call of the transformed function"
@@ -114,40 +114,40 @@ def traced_dtype(dtype: DType | None, name: str) -> np.dtype:
 
 def keys_shape(keys: Any) -> tuple[int, ...]:
     """The shape of an array of random keys; () for one key."""
-    # two kinds of keys: typed ones, and rows of uint32 as jax.random.PRNGKey makes them
+    # there are two kinds of keys: typed ones, and rows of uint32 from jax.random.PRNGKey
     return np.shape(keys) if jax.dtypes.issubdtype(keys.dtype, jax.dtypes.prng_key) else np.shape(keys)[:-1]
 
 
 def is_number(value: object) -> bool:
-    """True if ``value`` is one real number; truth values and text that looks like one are none."""
+    """True if ``value`` is one real number; booleans and text do not count."""
     if isinstance(value, (bool, str, bytes)) or value is None:
         return False
-    if isinstance(value, int):  # NumPy keeps one of 10^20 as an object, so that it is judged by itself
+    if isinstance(value, int):  # NumPy stores an integer like 10^20 as an object
         return value.bit_length() < 1024  # below 2^1023, where float() cannot overflow
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError):  # a ragged list, an object that fails on its way to an array
+    except (TypeError, ValueError):  # a ragged list, or an object that cannot become an array
         return False
     return array.ndim == 0 and array.dtype.kind in "fiu"
 
 
 def shown(value: object) -> str:
-    """A value as a refusal quotes it: its ``repr`` in one line of at most ``SHOWN`` characters."""
+    """A value for a message: its ``repr`` on one line of at most ``SHOWN`` characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= SHOWN else text[: SHOWN - 4] + " ..."
 
 
 def stretchings(stretch: Any, n: int) -> tuple[Stretching | None, ...]:
-    """The stretching of each of the n axes; None and () stand for no such axis."""
+    """The stretching of each of the n axes; None and () mean that no axis is stretched."""
     if stretch is None or (isinstance(stretch, tuple) and not stretch):
         return (None,) * n
     if isinstance(stretch, str) or not isinstance(stretch, Iterable):
-        raise TypeError(f"Grid.stretch: got {stretch!r}, wanted one an axis, as in (hjb.Sinh(3.0), None)")
+        raise TypeError(f"Grid.stretch: got {stretch!r}, wanted one entry per axis, as in (hjb.Sinh(3.0), None)")
     return tuple(stretch)
 
 
 def check_stretch(stretch: tuple, periodic: tuple[bool, ...]) -> None:
-    """Refuse stretchings of another type, and those of periodic axes."""
+    """Refuse stretchings of another type, and stretchings of periodic axes."""
     for axis, (stretching, cyclic) in enumerate(zip(stretch, periodic, strict=True)):
         if stretching is not None and not isinstance(stretching, Sinh):
             raise TypeError(f"Grid.stretch: entry {axis} is {stretching!r}; wanted Sinh(strength, center) or None")
@@ -180,21 +180,21 @@ def _ends(entry: object, axis: int, cyclic: bool, count: int) -> tuple[Any, Any]
         raise ValueError(f"Grid.edges: axis {axis} is periodic and has no ends; got {entry!r} there, wanted None")
     if cyclic:
         return None
-    # a name stands for both ends; as a Sequence it would be taken for a list of letters
+    # a name means both ends; a string is a Sequence, so it would be read as a list of letters
     pair = (entry, entry) if entry is None or isinstance(entry, (str, *PRESCRIBED)) else entry
     if not isinstance(pair, Sequence) or len(pair) != 2:
         raise ValueError(f"Grid.edges: axis {axis} has {entry!r}; wanted a name or a pair (lower end, upper end)")
     kinds = [_kind(end, f"axis {axis}") for end in pair]
-    if "open" in kinds and count < 3:  # a parabola goes on beyond the end
+    if "open" in kinds and count < 3:  # a parabola extends V beyond the end
         raise ValueError(
-            f"Grid.edges: axis {axis} has {count} points; an open end continues the last three. Take more points, or "
-            "edges='linear', which continues the last two"
+            f"Grid.edges: axis {axis} has {count} points; an open end extends V from the last three. Use more points, "
+            "or edges='linear', which needs only two"
         )
     return pair[0], pair[1]
 
 
 def _kind(name: object, where: str) -> str:
-    """The kind of one end by its name, or of a prescribed one; "projected" by default."""
+    """The kind of one end, given by name or as a prescribed end; "projected" by default."""
     if name is None:
         return "projected"
     if isinstance(name, PRESCRIBED):
@@ -210,19 +210,19 @@ def _kind(name: object, where: str) -> str:
 
 
 def corner(value: object, name: str) -> Array:
-    """One corner of the box: a number an axis."""
+    """One corner of the box: one number per axis."""
     corner = numbers(value, f"Grid.{name}")
     if np.ndim(corner) != 1 or np.size(corner) == 0:
-        raise ValueError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one an axis")
+        raise ValueError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one per axis")
     return corner
 
 
 def counts(shape: object) -> tuple[int, ...]:
-    """The points of every axis, at least two."""
+    """The number of points of every axis, at least two."""
     if isinstance(shape, str) or not isinstance(shape, (Sequence, np.ndarray)):
-        raise TypeError(f"Grid.shape: got {shape!r}, wanted a tuple of integers, one an axis")
+        raise TypeError(f"Grid.shape: got {shape!r}, wanted a tuple of integers, one per axis")
     for axis, count in enumerate(shape):
-        # True counts as 1 to Python; given here it was most likely meant for ``periodic``
+        # Python counts True as 1; a boolean here was probably meant for ``periodic``
         if isinstance(count, (bool, np.bool_)) or not isinstance(count, (int, np.integer)):
             raise TypeError(f"Grid.shape: axis {axis} has {count!r} points; wanted an integer")
         if count < 2:
@@ -231,13 +231,13 @@ def counts(shape: object) -> tuple[int, ...]:
 
 
 def periodic_flags(periodic: object, n: int) -> tuple[bool, ...]:
-    """One flag for each of the n axes, True where it is periodic; None and () stand for no such axis."""
+    """One flag for each of the n axes, True if it is periodic; None and () mean that no axis is."""
     if periodic is None or (isinstance(periodic, tuple) and not periodic):
         return (False,) * n
-    wanted = f"wanted one bool an axis (not axis numbers), as in {(True,) + (False,) * (n - 1)}"
+    wanted = f"wanted one bool per axis (not axis numbers), as in {(True,) + (False,) * (n - 1)}"
     if isinstance(periodic, (str, bool)) or not isinstance(periodic, (Sequence, np.ndarray)):
         raise TypeError(f"Grid.periodic: got {periodic!r}, {wanted}")
-    for axis, flag in enumerate(periodic):  # bools and no numbers: (2,) would else be "the third axis" or "true"
+    for axis, flag in enumerate(periodic):  # only bools: (2,) could mean "the third axis" or "true"
         if not isinstance(flag, (bool, np.bool_)):
             raise ValueError(f"Grid.periodic: entry {axis} is {flag!r}; {wanted}")
     return tuple(bool(flag) for flag in periodic)
@@ -249,28 +249,28 @@ def check_nodes(nodes: np.ndarray, axis: int, dtype: DType) -> None:
     if np.min(np.diff(nodes)) <= COINCIDING * np.finfo(dtype).eps * largest:
         lo, hi = float(nodes[0]), float(nodes[-1])
         raise ValueError(
-            f"Grid: axis {axis} has {len(nodes)} points between {lo:.17g} and {hi:.17g}: spacings that are "
-            f"rounding of its coordinates in {np.dtype(dtype)}; take fewer points, or measure the state from a "
+            f"Grid: axis {axis} has {len(nodes)} points between {lo:.17g} and {hi:.17g}: the spacing is below the "
+            f"rounding of its coordinates in {np.dtype(dtype)}; use fewer points, or measure the state from a "
             "point in the box"
         )
 
 
 def check_count(shape: tuple[int, ...]) -> None:
-    """Refuse more nodes than 32-bit indices number."""
+    """Refuse more nodes than 32-bit indices can number."""
     size, n = math.prod(shape), len(shape)
     if size >= INDEXABLE:
         raise MemoryError(
             f"{' x '.join(map(str, shape))} = {size:,} nodes; 32-bit indices number fewer than {INDEXABLE:,}.\n"
-            f"At most N = {math.floor((INDEXABLE - 1) ** (1 / n))} points an axis in {n}-D; {NO_GRID}."
+            f"At most N = {math.floor((INDEXABLE - 1) ** (1 / n))} points per axis in {n}-D; {NO_GRID}."
         )
 
 
 def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices: Any) -> Mesh | None:
-    """The mesh, unless the nodes cannot be divided over it, or not by these ``choices``; None where it is one device.
+    """The mesh, after checking that the nodes, and these ``choices``, can be divided over it; None for one device.
 
     Raises:
-      TypeError: no mesh.
-      ValueError: more axes than the grid has, parts of too few nodes, or a choice that reads nodes in its own way.
+      TypeError: an argument that is not a mesh.
+      ValueError: more axes than the grid has, parts with too few nodes, or a choice that does not support parts.
     """
     mesh = as_mesh(mesh, caller)
     counts, n = mesh.devices.shape, len(grid_shape)
@@ -281,14 +281,14 @@ def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices:
     for axis, (size, count) in enumerate(zip(counts, grid_shape, strict=False)):
         if size > 1 and count // size < FEWEST:
             raise ValueError(
-                f"{caller}: mesh divides the {count} points of axis {axis} into {size} parts; wanted {FEWEST} points a "
-                f"part at least, and so at most {count // FEWEST} parts"
+                f"{caller}: mesh divides the {count} points of axis {axis} into {size} parts; wanted at least {FEWEST} "
+                f"points per part, so at most {count // FEWEST} parts"
             )
     for choice in choices:
         if not choice.in_parts:
             raise ValueError(
-                f"{caller}: {choice!r} runs on one device; leave out mesh. What reads other nodes by "
-                "hjbjax.discretisation.stencil alone, and reduces by grid.largest, may say in_parts = True"
+                f"{caller}: {choice!r} runs on one device; leave out mesh. A class that reads other nodes only by "
+                "hjbjax.discretisation.stencil, and reduces by grid.largest, may set in_parts = True"
             )
     return mesh if mesh.size > 1 else None
 
@@ -298,5 +298,5 @@ def as_mesh(mesh: object, caller: str) -> Mesh:
     if not isinstance(mesh, Mesh):
         wanted = 'a jax.sharding.Mesh, as from jax.make_mesh((2,), ("x",))'
         raise TypeError(f"{caller}: mesh is {mesh!r}; wanted {wanted}")
-    # axes of other types than the manual ones of shard_map forbid slices
+    # shard_map's manual axes; axes of other types forbid slices
     return Mesh(mesh.devices, mesh.axis_names)

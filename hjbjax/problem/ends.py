@@ -1,8 +1,8 @@
 """Prescribed ends of the box: the value, the slope or the growth rate of V there.
 
-A ``Grid`` takes them in ``edges``, for one end at a time. Each holds a number or a function of the state, which is
+A ``Grid`` takes them in ``edges``, for one end at a time. Each is a number or a function of the state, which is
 evaluated at the nodes of that end when the grid is made. Slopes and rates are derivatives along the coordinate, not
-along the outward normal: at both ends of an increasing V the slope is positive.
+along the outward normal: if V increases, the slope is positive at both ends.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,9 @@
-"""The box of nodes on which a value function lives.
+"""The grid of nodes on which a value function is defined.
 
 Node-centred: both ends of an ordinary axis are nodes; a periodic axis omits its upper end. Coordinates are
-x_i = (lo·(M − i) + hi·i)/M with M = N − 1 (M = N on a periodic axis), so that a node at zero is exactly zero.
-They are computed once, in NumPy, one table an axis that travels with the grid: a compiled division rounds otherwise,
-and whether a node on the boundary of a target belongs to it must not depend on the program that asks.
+x_i = (lo·(M − i) + hi·i)/M with M = N − 1 (M = N on a periodic axis), so that a node at zero is exactly zero. NumPy
+computes them once, as one table per axis that is stored with the grid. A compiled division rounds differently, and a
+node on the boundary of a target must be inside or outside it in all programs alike.
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
 from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
 
-CONTINUED = ("open", "linear", "robin")  # kinds of ends beyond which V continues
-TABLED = 2**24  # points of an axis whose coordinates are kept, 128 MiB; a grid too large must not allocate them before
+CONTINUED = ("open", "linear", "robin")  # kinds of ends beyond which V is extended
+TABLED = 2**24  # points of an axis with a stored table, 128 MiB; a larger grid must not allocate before it is refused
 
 
 @pytree_dataclass(static=("shape", "periodic", "names", "edges", "units"))
@@ -33,21 +33,20 @@ class Grid:
 
     Args:
       lo: lower corner, shape (n,), in the units of each state.
-      hi: upper corner, shape (n,); on a periodic axis the point that is the same as ``lo``.
-      shape: number of nodes an axis, n integers of at least 2.
-      periodic: one bool per axis; by default no axis is periodic.
-      names: one name an axis, used by pictures and printed tables.
-      stretch: one ``Sinh(strength, center)`` or ``None`` per axis; by default all spacings are equal. Not on a
-        periodic axis.
-      edges: what happens to drift that points out of the box: a name for every end, or one entry an axis, a name or
+      hi: upper corner, shape (n,); on a periodic axis the point that is identified with ``lo``.
+      shape: number of nodes per axis, n integers of at least 2.
+      periodic: one bool per axis. Default: no periodic axes.
+      names: one name per axis, used by plots and printed tables.
+      stretch: one ``Sinh(strength, center)`` or ``None`` per axis. Default: uniform spacing. Not on a periodic axis.
+      edges: the treatment of drift that points out of the box: a name for every end, or one entry per axis, a name or
         a pair (lower end, upper end); ``None`` on a periodic axis, which has no ends.
-        "projected": the component that leaves is cut off, while the control keeps what it costs and earns.
-        "constrained": actions whose drift leaves are not admissible: the state-constrained problem.
-        "open": paths may leave; beyond the end V continues as the parabola through its last three nodes.
-        "linear": paths may leave; beyond the end V continues as the straight line through its last two nodes.
-        Noise reflects at a projected and at a constrained end, on the node itself, and continues at the other two.
-        A prescribed end: ``Dirichlet(value)``, ``Neumann(slope)`` or ``Robin(rate)``, see there.
-      units: one unit an axis, as in ("rad", "rad/s"), for pictures and printed tables; empty where there is none.
+        "projected": the outward component is set to zero, while the control keeps its cost.
+        "constrained": actions whose drift leaves the box are not admissible: the state-constrained problem.
+        "open": paths may leave; beyond the end V is extended by the parabola through its last three nodes.
+        "linear": paths may leave; beyond the end V is extended by the straight line through its last two nodes.
+        Noise reflects at a projected or constrained end, on the node itself, and uses the extension of V at the others.
+        A prescribed end: see ``Dirichlet(value)``, ``Neumann(slope)`` and ``Robin(rate)``.
+      units: one unit per axis, as in ("rad", "rad/s"), for plots and printed tables; empty without a unit.
 
     Raises:
       ValueError: bounds that are not finite or not increasing, lengths that differ, or an unknown kind of end.
@@ -82,7 +81,7 @@ class Grid:
         if len(set(lengths)) != 1:
             raise ValueError(
                 "Grid: got lo, hi, shape, periodic, names and stretch of lengths {}, {}, {}, {}, {} and {}; "
-                "wanted one entry an axis in each".format(*lengths)
+                "wanted one entry per axis in each".format(*lengths)
             )
         arguments.check_stretch(stretch, periodic)
         if isinstance(lo, np.ndarray) and isinstance(hi, np.ndarray):  # traced corners cannot be compared
@@ -101,10 +100,10 @@ class Grid:
         tables = (self._by_formula(axis) if count <= TABLED else None for axis, count in enumerate(shape))
         object.__setattr__(self, "coordinates", tuple(tables))
         object.__setattr__(self, "faces", tuple(self._faces(axis, given) for axis, given in enumerate(ends)))
-        self.check_spacings(np.float64)  # a solve asks again in its own dtype, which may be float32
+        self.check_spacings(np.float64)  # a solve repeats this in its own dtype, which may be float32
 
     def _faces(self, axis: int, pair: tuple[Any, Any] | None) -> tuple[Any, Any] | None:
-        """The prescriptions at the two ends of an axis, evaluated at their nodes; None without one."""
+        """The prescriptions at the two ends of an axis, evaluated at their nodes; None if neither is prescribed."""
         if pair is None or not any(isinstance(end, PRESCRIBED) for end in pair):
             return None
         found: list[Any] = []
@@ -121,38 +120,38 @@ class Grid:
         return found[0], found[1]
 
     def prescribed(self, *kinds: str) -> list[tuple[int, int, Any]]:
-        """The prescribed ends of these kinds, or of all: an axis, a step, and the prescription at the nodes there."""
+        """The prescribed ends of these kinds, or of all kinds: axis, step, and the prescription at the nodes."""
         found = (
             (axis, step, pair[(step + 1) // 2]) for axis, pair in enumerate(self.faces) if pair for step in (-1, 1)
         )
         return [each for each in found if each[2] is not None and (not kinds or each[2].kind in kinds)]
 
     def refuse_prescribed(self, name: str, why: str) -> None:
-        """Refuse prescribed ends in the name of a function, with the reason.
+        """Refuse prescribed ends on behalf of a function, with the reason.
 
         Raises:
-          ValueError: with the ends.
+          ValueError: the grid has prescribed ends.
         """
         found = sorted({type(end).__name__ for _, _, end in self.prescribed()})
         if found:
             raise ValueError(f"{name}: got a grid with {' and '.join(found)} ends, {why}; use edges='projected'")
 
     def check_spacings(self, dtype: DType) -> None:
-        """Refuse nodes that coincide up to rounding in ``dtype``: differences of values would be rounding as well.
+        """Refuse nodes that coincide up to rounding in ``dtype``, because differences of values would be rounding too.
 
         Raises:
           ValueError: with the axis and its ends.
         """
         for axis, nodes in enumerate(self.coordinates):
-            if isinstance(nodes, np.ndarray):  # neither traced nor too many to be kept
+            if isinstance(nodes, np.ndarray):  # not traced, and not too many to be stored
                 arguments.check_nodes(nodes, axis, dtype)
 
     def check_indices(self) -> None:
-        """Refuse what no solve can start from, before anything of the size of the grid is allocated or compiled.
+        """Refuse a grid that no solve can use, before anything of the size of the grid is allocated or compiled.
 
         Raises:
-          MemoryError: more nodes than 32-bit indices number, with the largest N that can be numbered.
-          ValueError: prescribed ends without their numbers, as of a grid from a file.
+          MemoryError: more nodes than 32-bit indices can number; the message has the largest possible N.
+          ValueError: prescribed ends without their numbers, as on a grid from a file.
         """
         arguments.check_count(self.shape)
         known = {(axis, step) for axis, step, _ in self.prescribed()}
@@ -160,7 +159,7 @@ class Grid:
             axis, step = min(missing)
             raise ValueError(
                 f"Grid.edges: the {'upper' if step > 0 else 'lower'} end of {self.names[axis]} is prescribed, but its "
-                "numbers are unknown: files do not keep them. Make the Grid again, with hjb.Dirichlet(value), "
+                "numbers are unknown, because files do not store them. Make the Grid again with hjb.Dirichlet(value), "
                 "hjb.Neumann(slope) or hjb.Robin(rate)"
             )
 
@@ -171,7 +170,7 @@ class Grid:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """One text an axis: its name, and its unit in brackets where there is one."""
+        """One text per axis: its name, and its unit in brackets if it has one."""
         return tuple(map(with_unit, self.names, self.units))
 
     @property
@@ -182,7 +181,7 @@ class Grid:
     def sides(self, kind: str) -> list[tuple[int, int]]:
         """The sides of the box with ends of this kind: pairs of an axis and a step, −1 lower and 1 upper.
 
-        Linear and Robin ends count as "open" as well: V continues beyond all of them, and none belongs to a chain.
+        Linear and Robin ends count as "open": V is extended beyond all three, and none belongs to a Markov chain.
         """
         kinds = CONTINUED if kind == "open" else (kind,)
         ends = ((axis, pair) for axis, pair in enumerate(self.edges) if pair is not None)  # None: a periodic axis
@@ -190,7 +189,7 @@ class Grid:
 
     @property
     def walled(self) -> "Grid":
-        """The grid with the ends of a chain: projected ones instead of open, linear and Robin ends."""
+        """The grid with the ends of a Markov chain: projected ends instead of open, linear and Robin ends."""
         pairs = (pair and tuple("projected" if name in CONTINUED else name for name in pair) for pair in self.edges)
         return altered(self, edges=tuple(pairs))
 
@@ -199,7 +198,7 @@ class Grid:
         return altered(self, shape=parts.shape, parts=parts)
 
     def settled(self) -> "Grid":
-        """The grid for a program in which it does not change: what is made of its corners is made here, by NumPy."""
+        """The grid for a program in which it does not change: NumPy computes all numbers derived from its corners."""
         if any(table is None for table in self.coordinates):
             return self
         lo, hi = (tuple(np.asarray(corner)) for corner in (self.lo, self.hi))
@@ -215,7 +214,7 @@ class Grid:
         return self if self.parts is None else altered(self, shape=self.parts.whole, parts=None)
 
     def is_divided(self, axis: int) -> bool:
-        """True if the nodes along an axis lie on several devices, and those here are some of them."""
+        """True if the nodes along an axis are divided over several devices, so that this part holds some of them."""
         return self.parts is not None and axis in self.parts.axes
 
     def largest(self, values: AtNodes) -> Scalar:
@@ -223,7 +222,7 @@ class Grid:
         return jnp.max(values) if self.parts is None else self.parts.largest(values)
 
     def least(self, values: AtNodes) -> Scalar:
-        """The least of node values, on all devices."""
+        """The smallest of node values, on all devices."""
         return jnp.min(values) if self.parts is None else -self.parts.largest(-values)
 
     def total(self, values: AtNodes) -> Scalar:
@@ -235,7 +234,7 @@ class Grid:
         return jnp.any(mask) if self.parts is None else self.parts.some(mask)
 
     def first(self, mask: Mask) -> Scalar:
-        """The first node of a mask, (*grid), counted flat over the whole grid; −1 where there is none."""
+        """The flat index, over the whole grid, of the first node of a mask, (*grid); −1 for an empty mask."""
         if self.parts is None:
             return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
         return self.parts.first(mask)
@@ -246,7 +245,7 @@ class Grid:
         return count if self.periodic[axis] else count - 1
 
     def spacing(self, axis: int) -> Number:
-        """The distance h between neighbours along ``axis``; their mean on a stretched one."""
+        """The distance h between neighbours along ``axis``; the mean distance on a stretched axis."""
         return self.spacings[axis] if self.spacings else (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
@@ -257,14 +256,14 @@ class Grid:
             return jnp.asarray(self.coordinates[axis], dtype or jnp.result_type(float))
         computed, table = self._by_formula(axis), self.coordinates[axis]
         table = computed if table is None else table
-        # NumPy as long as nothing is traced, also inside ``jit``, where the table then is a constant
+        # NumPy if nothing is traced, also inside ``jit``, where the table then is a constant
         if is_traced(computed, table):
             given = (computed, table, jnp.maximum(jnp.abs(self.lo[axis]), jnp.abs(self.hi[axis])))
             return from_table(*(jnp.asarray(each, dtype or jnp.result_type(float)) for each in given))
         return np.asarray(table, dtype or np.float64)
 
     def _by_formula(self, axis: int) -> Array:
-        """The coordinates by the formula, in NumPy where the corners are known numbers."""
+        """The coordinates by the formula, in NumPy if the corners are known numbers."""
         index: Array = np.arange(self.shape[axis], dtype=np.float64)
         last = self.intervals(axis)
         stretching = self.stretch[axis]
@@ -273,7 +272,7 @@ class Grid:
         return (known(self.lo)[axis] * (last - index) + known(self.hi)[axis] * index) / last
 
     def components(self, dtype: DType) -> list[jax.Array]:
-        """The coordinates as n arrays, the i-th of which varies along axis i alone and broadcasts."""
+        """The coordinates as n arrays; the i-th varies only along axis i and broadcasts."""
         columns = []
         for axis, count in enumerate(self.shape):
             along = [1] * self.ndim
@@ -282,34 +281,34 @@ class Grid:
         return columns
 
     def state(self, index: Sequence[int]) -> np.ndarray:
-        """The state at a node, shape (n,); host level."""
+        """The state at a node, shape (n,); on the host."""
         return np.array([np.asarray(self.axis(axis))[i] for axis, i in enumerate(index)])
 
     def nodes(self) -> np.ndarray:
-        """All states, shape (*grid, n), at host level: a table for tests and pictures, not for solvers."""
+        """All states, shape (*grid, n), on the host: a table for tests and plots, not for solvers."""
         return np.stack(np.meshgrid(*(np.asarray(self.axis(i)) for i in range(self.ndim)), indexing="ij"), axis=-1)
 
     def inner(self, share: float) -> np.ndarray:
-        """The nodes in the middle ``share`` of every axis that is not periodic, bool (*grid); host level."""
+        """The nodes in the middle ``share`` of every axis that is not periodic, bool (*grid); on the host."""
         inside = np.ones(self.shape, bool)
         for axis in range(self.ndim):
             if not self.periodic[axis]:
                 nodes, lo, hi = np.asarray(self.axis(axis)), float(self.lo[axis]), float(self.hi[axis])
-                # a node that lies on the rim belongs to the middle, whichever way its coordinate was rounded
+                # a node on the rim belongs to the middle, for any rounding of its coordinate
                 near = np.abs(nodes - (lo + hi) / 2) <= share * (hi - lo) / 2 * (1 + 1e-9)
                 inside &= near.reshape([-1 if i == axis else 1 for i in range(self.ndim)])
         return inside
 
     def volumes(self) -> np.ndarray:
-        """The part of the box that belongs to each node, shape (*grid), host level: half cells at ends that are nodes.
+        """The part of the box that belongs to each node, shape (*grid), on the host: half cells at ends that are nodes.
 
-        Their sum is the volume of the box, and sums of node values weighted by them are trapezoidal integrals.
+        Their sum is the volume of the box. Sums of node values weighted by them are trapezoidal integrals.
         """
         total = np.ones(())
         for axis, count in enumerate(self.shape):
             gaps = np.diff(np.append(np.asarray(self.axis(axis)), self.hi[axis] if self.periodic[axis] else []))
-            # Each gap gives half to the node before and half to the one behind it. On a periodic axis there are as many
-            # gaps as nodes and the two slices are one, which is right as such an axis is uniform.
+            # Each gap gives half to the node on either side. A periodic axis has one gap per node, so the two slices
+            # are the same, which is right because it is uniform.
             share = np.zeros(count)
             share[: len(gaps)] += gaps / 2
             share[-len(gaps) :] += gaps / 2
@@ -317,36 +316,36 @@ class Grid:
         return total
 
     def wrap(self, x: States) -> jax.Array:
-        """States with their periodic entries brought into [lo, hi); the others as they are."""
+        """States with their periodic entries wrapped into [lo, hi); other entries are unchanged."""
         x = _states(x)
         lo, hi = jnp.asarray(self.lo, x.dtype), jnp.asarray(self.hi, x.dtype)
         return jnp.where(np.array(self.periodic), into_period(x, lo, hi), x)
 
     def beyond(self, x: States) -> np.ndarray:
-        """True for the states outside the box by more than rounding; known numbers alone."""
+        """True for states outside the box by more than rounding; for known numbers only."""
         x, lo, hi = np.asarray(x, float), np.asarray(self.lo, float), np.asarray(self.hi, float)
-        slack = 8 * np.finfo(float).eps * np.maximum(hi - lo, np.maximum(abs(lo), abs(hi)))  # that of ``_locate``
+        slack = 8 * np.finfo(float).eps * np.maximum(hi - lo, np.maximum(abs(lo), abs(hi)))  # as in ``_locate``
         return np.any(((x < lo - slack) | (x > hi + slack)) & ~np.array(self.periodic), axis=-1)
 
     def interpolate(self, values: Array, x: States, *, clamp: bool = False) -> jax.Array:
-        """Multilinear interpolation of node values, second order; jit- and vmap-able.
+        """Multilinear interpolation of node values, second order; supports ``jit`` and ``vmap``.
 
         Args:
           values: shape (*grid, ...).
           x: states, shape (..., n).
-          clamp: outside the box take the nearest point of the box; otherwise the answer there is NaN.
+          clamp: True uses the nearest point of the box for states outside; False gives NaN there.
 
         Returns:
           Shape ``x.shape[:-1] + values.shape[n:]``.
         """
         values, x = jnp.asarray(values), _states(x)
         if x.ndim == 0 or x.shape[-1] != self.ndim:
-            raise ValueError(f"Grid: got states of shape {x.shape}, wanted (..., {self.ndim}): one entry an axis")
+            raise ValueError(f"Grid: got states of shape {x.shape}, wanted (..., {self.ndim}): one entry per axis")
         if values.shape[: self.ndim] != self.shape:
-            raise ValueError(f"Grid: got values of shape {values.shape}, wanted {self.shape} first: one a node")
+            raise ValueError(f"Grid: got values of shape {values.shape}, wanted {self.shape} first: one per node")
         x = self.wrap(x)
         cells, fractions, inside = zip(*(self._locate(axis, x[..., axis]) for axis in range(self.ndim)), strict=True)
-        trailing = (1,) * (values.ndim - self.ndim)  # weights are per state, values may be vectors
+        trailing = (1,) * (values.ndim - self.ndim)  # weights are per state; values may be vectors
         total = jnp.zeros((), x.dtype)
         for corner in np.ndindex(*(2,) * self.ndim):
             weight = jnp.ones((), x.dtype)  # w_c = Π_i (s_i or 1 − s_i)
@@ -354,45 +353,45 @@ class Grid:
                 weight = weight * (fraction if bit else 1 - fraction)
             index = tuple((cell + bit) % count for cell, bit, count in zip(cells, corner, self.shape, strict=True))
             weight, at_corner = weight.reshape(weight.shape + trailing), values[index]
-            # A corner of no weight may be infinite (0 · inf); where it is finite it still carries the derivative.
+            # A corner with weight zero may be infinite (0 · inf); if it is finite it still contributes to derivatives.
             total = total + weight * jnp.where((weight == 0) & ~jnp.isfinite(at_corner), 0, at_corner)
         hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack(inside), axis=0))
         return jnp.where(hidden.reshape(hidden.shape + trailing), jnp.nan, total)
 
     def _locate(self, axis: int, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The node below ``x``, the fraction of the way to the next, and a flag: True if ``x`` lies in the box."""
+        """The node below ``x``, the fraction of the distance to the next node, and True if ``x`` is in the box."""
         lo, hi, last = jnp.asarray(self.lo[axis], x.dtype), jnp.asarray(self.hi[axis], x.dtype), self.intervals(axis)
         place = (x - lo) / (hi - lo)
         if self.stretch[axis] is not None:
             return self._locate_stretched(axis, x, place)
         place = place * last
-        # What rounding of coordinates of the size of the ends can do to a place, in cells, with room to spare.
+        # the rounding error of a position in cells, for coordinates of the size of the ends, with a margin
         slack = 8 * last * jnp.finfo(x.dtype).eps * jnp.maximum(1, jnp.maximum(abs(lo), abs(hi)) / (hi - lo))
         inside = (place >= -slack) & (place <= last + slack)  # NaN counts as outside
         place = jnp.clip(jnp.nan_to_num(place), 0, last)
-        # A node is met exactly, so that an infinite neighbour stays out of it; the derivative is untouched.
+        # snap to a node, so that an infinite neighbour has weight exactly zero; the derivative is unchanged
         to_node = jax.lax.stop_gradient(jnp.round(place) - place)
         place = place + jnp.where(abs(to_node) <= slack, to_node, 0)
         cell = jnp.minimum(jnp.floor(jax.lax.stop_gradient(place)), last - 1).astype(int)
         return cell, place - cell, inside
 
     def _locate_stretched(self, axis: int, x: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Node, fraction and flag on a stretched axis: the cell by φ⁻¹, the fraction by the coordinates of its ends."""
-        slack = 64 * jnp.finfo(x.dtype).eps  # of the whole axis, as ``place`` runs from 0 to 1
+        """Node, fraction and flag on a stretched axis: the cell from φ⁻¹, the fraction from the nodes of the cell."""
+        slack = 64 * jnp.finfo(x.dtype).eps  # relative to the whole axis, since ``place`` runs from 0 to 1
         inside = (place >= -slack) & (place <= 1 + slack)
         nodes, last = jnp.asarray(self.axis(axis), x.dtype), self.intervals(axis)
         stretch = self.stretch[axis]
         assert stretch is not None
         guess = last * stretch.fraction(jnp.clip(jnp.nan_to_num(place), 0, 1))
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(guess)).astype(int), 0, last - 1)
-        # the inverse map is off by rounding, and its cell by one at most: the coordinates decide
+        # rounding in the inverse map may shift the cell by one, so compare with the coordinates
         cell = jnp.clip(cell + (x >= nodes[cell + 1]) - (x < nodes[cell]), 0, last - 1)
         fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
-        fraction = jnp.nan_to_num(fraction)  # a clip would halve the derivative on a node, where it is 0 or 1
+        fraction = jnp.nan_to_num(fraction)  # no clip here: it would halve the derivative at a node
         return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
 
 
 def _states(x: Numbers) -> jax.Array:
-    """States as a floating-point array; integers in JAX's ``float``."""
+    """States as a floating-point array; integers become JAX's default float."""
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)

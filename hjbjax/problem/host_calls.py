@@ -1,6 +1,6 @@
-"""Calls of the host from inside compiled programs, with numbers of any width.
+"""Host callbacks from compiled programs, with numbers of any width.
 
-The thread of a callback does not know of ``jax.enable_x64``, and JAX would round doubles on the way. So they travel as
+The thread of a callback ignores ``jax.enable_x64``, so JAX would round doubles on the way. They are therefore sent as
 pairs of 32-bit words.
 """
 
@@ -15,14 +15,14 @@ WORD = np.dtype(np.uint32)
 
 
 def call_on_host(function: Callable[..., Any], result: T, *arrays: Any, vmap_method: str) -> T:
-    """The result of a function of NumPy arrays, called on the host when the program comes to it.
+    """The result of a function of NumPy arrays, called on the host while the program runs.
 
     Args:
-      function: from NumPy arrays to a tree of arrays like ``result``.
-      result: the shapes and types of what it returns, a tree of ``jax.ShapeDtypeStruct``.
-      arrays: its arguments; only traced ones are worth passing, others can be closed over.
+      function: takes NumPy arrays and returns a tree of arrays like ``result``.
+      result: the shapes and types of the result, a tree of ``jax.ShapeDtypeStruct``.
+      arrays: the arguments; only traced ones need to be passed, others can be closed over.
       vmap_method: of ``jax.pure_callback``. With "expand_dims" the function is called once for a whole batch, and
-        arguments and results have leading axes, of length 1 in arguments that do not vary.
+        arguments and results have leading axes, of length 1 for arguments that do not vary.
     """
     leaves, structure = jax.tree.flatten(result)
     kinds = [np.dtype(array.dtype) for array in arrays]
@@ -44,22 +44,22 @@ def call_on_host(function: Callable[..., Any], result: T, *arrays: Any, vmap_met
 
 
 def _is_wide(dtype: Any) -> bool:
-    """True for numbers of 64 bits, which are two words on one more axis."""
+    """True for 64-bit numbers, which are sent as two words on an additional axis."""
     return np.dtype(dtype).itemsize > WORD.itemsize
 
 
 def _shape_in_words(shape: Sequence[int], dtype: Any) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type of numbers on the way."""
+    """Shape and type of numbers as they are sent."""
     return ((*shape, 2), WORD) if _is_wide(dtype) else (tuple(shape), np.dtype(dtype))
 
 
 def _numbers(words: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """The numbers that arrived."""
+    """The numbers as received."""
     return np.ascontiguousarray(words).view(dtype)[..., 0] if _is_wide(dtype) else words
 
 
 def _words(numbers: np.ndarray) -> np.ndarray:
-    """The numbers as they leave."""
+    """The numbers as they are sent."""
     if not _is_wide(numbers.dtype):
         return numbers
-    return np.array(numbers)[..., None].view(WORD)  # of ``ascontiguousarray`` one number has an axis
+    return np.array(numbers)[..., None].view(WORD)  # ``ascontiguousarray`` would add an axis to a single number

@@ -1,11 +1,11 @@
-"""The nodes of a grid in parts, one for every device of a mesh: what a part holds, and what it reads of the others.
+"""The nodes of a grid in parts, one per device of a mesh, and the exchange of values between parts.
 
-Domain decomposition by ``jax.shard_map``: every device runs the program of a single one on a grid that knows its part,
-fetches the nodes just beyond it from the parts beside by ``ppermute``, and joins what it finds by ``pmax`` or ``psum``.
-The i-th axis of the mesh divides the i-th axis of the grid. Of N nodes part k of p has those from ⌊kN/p⌋ up to
-⌊(k + 1)N/p⌋, so that two parts differ by one node at most. Arrays have ⌈N/p⌉ entries a part: where it has one node
-less, the last entry is a filler, a copy of the node that comes next. No node reads what becomes of a filler, and no
-reduction counts it.
+Domain decomposition by ``jax.shard_map``: every device runs the single-device program on its part of the grid. It
+fetches the nodes just beyond its part from the neighbouring parts by ``ppermute`` and reduces by ``pmax`` or ``psum``.
+The i-th axis of the mesh divides the i-th axis of the grid. With N nodes, part k of p has the nodes from ⌊kN/p⌋ up to
+⌊(k + 1)N/p⌋, so that parts differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node less
+has a filler as its last entry, a copy of the next node. No node reads the value computed at a filler, and reductions
+ignore fillers.
 """
 
 import dataclasses
@@ -21,17 +21,17 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from hjbjax.problem.types import AtNodes, Mask, Scalar
 
 T = TypeVar("T")
-FEWEST = 3  # nodes of a part along a divided axis: what Weno5, and a parabola beyond an end, read at once
+FEWEST = 3  # nodes of a part along a divided axis: the reach of Weno5 and of a parabola beyond an end
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Parts:
-    """The nodes of a grid over the devices of a mesh. What is traced here has a meaning inside ``shard_map`` alone.
+    """The nodes of a grid over the devices of a mesh. Traced methods work only inside ``shard_map``.
 
     Args:
-      mesh: the devices; no more axes than the grid has.
-      whole: the nodes of the whole grid along every axis.
+      mesh: the devices, with at most as many axes as the grid.
+      whole: the number of nodes of the whole grid along every axis.
     """
 
     mesh: Mesh
@@ -39,7 +39,7 @@ class Parts:
 
     @property
     def names(self) -> tuple[str | None, ...]:
-        """The axis of the mesh that divides each axis of the grid; None where it is whole."""
+        """The axis of the mesh that divides each axis of the grid; None for an undivided axis."""
         pairs = zip(self.mesh.axis_names, self.mesh.devices.shape, strict=True)
         found = [name if size > 1 else None for name, size in pairs]
         return (*found, *[None] * (len(self.whole) - len(found)))
@@ -51,7 +51,7 @@ class Parts:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The entries of the arrays of one part along every axis."""
+        """The number of entries of one part's arrays along every axis."""
         return tuple(-(-count // size) for count, size in zip(self.whole, self.sizes, strict=True))
 
     @property
@@ -65,38 +65,38 @@ class Parts:
         return all(self.whole[axis] // self.sizes[axis] >= FEWEST for axis in self.axes)
 
     def even(self, axis: int) -> bool:
-        """True if all parts have as many nodes along an axis."""
+        """True if all parts have the same number of nodes along an axis."""
         return self.whole[axis] % self.sizes[axis] == 0
 
     def _starts(self, axis: int) -> np.ndarray:
-        """The first node of every part along an axis, and behind them their number, (p + 1,)."""
+        """The first node of every part along an axis, followed by the number of nodes, (p + 1,)."""
         size = self.sizes[axis]
         return np.array([k * self.whole[axis] // size for k in range(size + 1)])
 
     def _nodes_of_entries(self, axis: int) -> np.ndarray:
-        """The node that each entry of an array of all parts holds along an axis; fillers copy the next one."""
+        """The node at each entry of an array of all parts along an axis; fillers copy the next node."""
         reach = self._starts(axis)[:-1, None] + np.arange(self.shape[axis])
         return np.minimum(reach, self.whole[axis] - 1).ravel()
 
     def _entries_of_nodes(self, axis: int) -> np.ndarray:
-        """The entry of an array of all parts at which each node stands along an axis."""
+        """The entry of each node in an array of all parts along an axis."""
         starts = self._starts(axis)
         width = self.shape[axis]
         return np.concatenate([k * width + np.arange(n) for k, n in enumerate(np.diff(starts))])
 
-    # On the host: arrays of the whole grid, and those of all parts.
+    # On the host: arrays of the whole grid and arrays of all parts.
 
     @property
     def entries(self) -> tuple[int, ...]:
-        """The shape of an array of all parts, fillers among them."""
+        """The shape of an array of all parts, including fillers."""
         return tuple(width * size for width, size in zip(self.shape, self.sizes, strict=True))
 
     def spread(self, tree: T, over_nodes: Any) -> T:
-        """Arrays of the whole grid as those of the parts on their devices; others whole on every device.
+        """Divide arrays of the whole grid over the devices, and copy the others to every device.
 
         Args:
           tree: numbers and arrays.
-          over_nodes: a tree of the same structure of truth values: the leaves that hold a value at every node, (*grid).
+          over_nodes: a tree of the same structure, True for leaves with one value per node, (*grid).
         """
 
         def put(leaf: Any, divided: bool) -> jax.Array:
@@ -104,7 +104,7 @@ class Parts:
             for axis in self.axes if divided else ():
                 if not self.even(axis):
                     host = np.take(host, self._nodes_of_entries(axis), axis)
-            # each process makes what its own devices hold; a copy, since states are donated
+            # each process makes the values of its own devices; a copy, because states are donated
             return jax.make_array_from_callback(
                 host.shape, self._sharding(divided), lambda index: np.array(host[index])
             )
@@ -115,7 +115,7 @@ class Parts:
         """The inverse of ``spread``: NumPy arrays of the whole grid."""
 
         def take(leaf: Any, divided: bool) -> np.ndarray:
-            # what other processes hold comes from them, and all of them have to ask
+            # values of other processes must be requested by all processes
             far = isinstance(leaf, jax.Array) and divided and not leaf.is_fully_addressable
             host = np.asarray(multihost_utils.process_allgather(leaf, tiled=True) if far else leaf)
             for axis in self.axes if divided else ():
@@ -126,13 +126,13 @@ class Parts:
         return jax.tree.map(take, tree, over_nodes)
 
     def mapped(self, function: Callable, over_nodes: Any, result_over_nodes: Any) -> Callable:
-        """A function on every device at once, of arrays that ``spread`` has put there: of each its own part."""
+        """A function that runs on every device at once, each with its own part of arrays from ``spread``."""
         specs = (jax.tree.map(self._spec, marks) for marks in (over_nodes, result_over_nodes))
-        # what every device holds alike is made alike, by reductions over all of them
+        # values that are the same on every device come from reductions over all devices
         return jax.shard_map(function, mesh=self.mesh, in_specs=next(specs), out_specs=next(specs), check_vma=False)
 
     def _spec(self, divided: bool) -> PartitionSpec:
-        """How an array lies on the mesh."""
+        """The layout of an array on the mesh."""
         return PartitionSpec(*self.names) if divided else PartitionSpec()
 
     def _sharding(self, divided: bool) -> NamedSharding:
@@ -145,13 +145,13 @@ class Parts:
         return jax.lax.axis_index(self.names[axis])
 
     def count(self, axis: int) -> int | Scalar:
-        """The nodes of this part along an axis; a known number where all have as many."""
+        """The number of nodes of this part along an axis; a known number if all parts have the same number."""
         if self.even(axis):
             return self.shape[axis]
         return jnp.asarray(np.diff(self._starts(axis)), jnp.int32)[self.index(axis)]
 
     def nodes(self, axis: int) -> jax.Array:
-        """The number of the node that each entry holds along a divided axis; of a filler that of the next node."""
+        """The index of the node at each entry along a divided axis; a filler has the index of the next node."""
         start = jnp.asarray(self._starts(axis)[:-1], jnp.int32)[self.index(axis)]
         return start + jnp.arange(self.shape[axis], dtype=jnp.int32)
 
@@ -160,23 +160,23 @@ class Parts:
         return self.nodes(axis) == (self.whole[axis] - 1 if step > 0 else 0)
 
     def own(self, table: Any, axis: int) -> Any:
-        """The entries of this part of a table of all nodes along an axis."""
+        """This part's entries of a table of all nodes along an axis."""
         if self.names[axis] is None:
             return table
         return jnp.take(jnp.asarray(table), self.nodes(axis), axis=0, mode="clip")
 
     def at_end(self, axis: int, step: int) -> jax.Array:
-        """True if this part lies at the end of an axis in the direction of ``step``."""
+        """True if this part is at the end of an axis in the direction of ``step``."""
         return self.index(axis) == (self.sizes[axis] - 1 if step > 0 else 0)
 
     def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
-        """What the part beside this one in the direction of ``step`` gives away; zero beyond the ends unless cyclic."""
+        """The values of the neighbouring part in the direction of ``step``; zero beyond the ends unless cyclic."""
         last, size = self.sizes[axis] - 1, self.sizes[axis]
         pairs = [((k + step) % size, k) for k in range(size) if cyclic or k != (last if step > 0 else 0)]
         return jax.lax.ppermute(values, self.names[axis], pairs)
 
     def _real(self) -> jax.Array | None:
-        """The entries that are nodes and no fillers, bool; broadcasts. None where all are."""
+        """True at entries that are nodes, False at fillers; broadcasts. None if there are no fillers."""
         found = None
         for axis in self.axes:
             if not self.even(axis):
@@ -191,14 +191,14 @@ class Parts:
         return values if real is None else jnp.where(real, values, jnp.zeros((), values.dtype))
 
     def _reduced(self, values: AtNodes | Mask, within: Callable, across: Callable, neutral: Any) -> jax.Array:
-        """A reduction over all nodes: ``within`` each part, and then ``across`` them; fillers are neutral."""
+        """A reduction over all nodes: ``within`` each part, then ``across`` parts; fillers are neutral."""
         real = self._real()
         if real is not None:
             values = jnp.where(real, values, jnp.asarray(neutral, jnp.result_type(values)))
         return across(within(values), tuple(name for name in self.names if name is not None))
 
     def largest(self, values: AtNodes) -> jax.Array:
-        """The largest of the values at all nodes; NaN if one of them is."""
+        """The largest of the values at all nodes; NaN if one of them is NaN."""
         return self._reduced(values, jnp.max, _largest, -jnp.inf)
 
     def total(self, values: AtNodes) -> jax.Array:
@@ -210,7 +210,7 @@ class Parts:
         return self._reduced(mask, lambda found: jnp.any(found).astype(jnp.int32), jax.lax.pmax, False) > 0
 
     def first(self, mask: Mask) -> jax.Array:
-        """The least number in C order of the nodes of a mask, (*grid); −1 where there is none."""
+        """The smallest index in C order of the nodes of a mask, (*grid); −1 for an empty mask."""
         number = jnp.zeros((), jnp.int32)
         for axis, count in enumerate(self.whole):
             along = [-1 if i == axis else 1 for i in range(len(self.whole))]
@@ -223,32 +223,32 @@ class Parts:
 
 @dataclasses.dataclass(frozen=True)
 class Lanes:
-    """Lanes of a batch over all devices of a mesh, as many on each: the leading axis of every array.
+    """Lanes of a batch over all devices of a mesh, the same number on each: the leading axis of every array.
 
     Args:
-      mesh: the devices; None for one.
+      mesh: the devices; None for a single device.
     """
 
     mesh: Mesh | None = None
 
     @property
     def spec(self) -> PartitionSpec:
-        """How an array lies on the mesh: its lanes along all axes together."""
+        """The layout of an array on the mesh: its lanes along all axes together."""
         return PartitionSpec(() if self.mesh is None else self.mesh.axis_names)
 
     @property
     def on_processors(self) -> bool:
-        """True if the devices are cores of a processor, each of which one lane keeps busy."""
+        """True if the devices are CPU cores, each of which one lane keeps busy."""
         return self.mesh is not None and self.mesh.devices.flat[0].platform == "cpu"
 
     @staticmethod
     def in_turn(function: Callable) -> Callable:
-        """A function of one lane for lanes one after the other, each of which ends its loop by itself."""
-        # 48 pendulums on 100 x 101 took what they take in threads; by vmap 1.3 to 1.8 times as long
+        """A function of one lane applied to lanes one after the other, each with its own number of iterations."""
+        # 48 pendulums on 100 x 101 nodes take as long as in threads; vmap takes 1.3 to 1.8 times as long
         return lambda *rows: jax.lax.map(lambda row: function(*row), rows)
 
     def filled(self, count: int) -> int:
-        """The least number of rows, at least ``count``, of which every device takes as many."""
+        """The smallest number of rows, at least ``count``, that divides evenly over the devices."""
         size = 1 if self.mesh is None else self.mesh.size
         return -(-count // size) * size
 
@@ -270,20 +270,20 @@ class Lanes:
         return multihost_utils.process_allgather(tree, tiled=True) if far else jax.device_get(tree)
 
     def mapped(self, function: Callable) -> Callable:
-        """A function of arrays of lanes, on every device for its own, none of which waits for another."""
+        """A function of arrays of lanes that runs on every device independently."""
         if self.mesh is None:
             return function
         return jax.shard_map(function, mesh=self.mesh, in_specs=self.spec, out_specs=self.spec, check_vma=False)
 
 
 def spans_processes(mesh: Mesh | None) -> bool:
-    """True if some of the devices are those of other processes."""
+    """True if some of the devices belong to other processes."""
     return mesh is not None and any(device.process_index != jax.process_index() for device in mesh.devices.flat)
 
 
 def _largest(value: Scalar, names: tuple[str, ...]) -> Scalar:
-    """The largest of one number a part; NaN if one of them is, whatever the order in which a backend compares."""
+    """The largest of one number per part; NaN if one of them is NaN, for any backend's order of comparisons."""
     lost = jnp.isnan(value)
-    # one exchange for both: a maximum that drops a NaN would call it converged
+    # one exchange for both: a maximum that drops a NaN would count as converged
     found = jax.lax.pmax(jnp.stack([jnp.where(lost, -jnp.inf, value), lost.astype(value.dtype)]), names)
     return jnp.where(found[1] > 0, jnp.nan, found[0])

@@ -1,9 +1,9 @@
-"""The question: one variational inequality, every ingredient optional.
+"""The control problem or differential game: one variational inequality, with every ingredient optional.
 
     min{ max{ β V − V_t − H(x, DV, D²V),  V − ψ },  V − g } = 0
     H = min_u max_d [ L(x,u,d) + f(x,u,d)·DV + ½ tr(σσᵀ(x,u,d) D²V) ]
 
-The control minimises cost, the disturbance maximises it. Everything here is written for one state.
+The control minimises the cost, the disturbance maximises it. All functions act on one state.
 """
 
 import dataclasses
@@ -26,12 +26,12 @@ class Problem:
     """An optimal control problem or a two-player zero-sum differential game.
 
     Functions act on one state. ``drift``, ``cost`` and a callable ``noise`` take ``(x, u)``; they take
-    ``(x, u, d)`` exactly when ``disturbances`` is given. ``target``, ``exit_cost``, ``terminal_cost``,
-    ``stopping_cost`` and ``running_max`` take ``(x)``. With ``time_dependent=True`` the time goes first in all.
+    ``(x, u, d)`` if ``disturbances`` is given. ``target``, ``exit_cost``, ``terminal_cost``,
+    ``stopping_cost`` and ``running_max`` take ``(x)``. With ``time_dependent=True`` the time comes first in all.
 
     Args:
       drift: f, returns shape (n,): the rate of change of the state.
-      cost: L, returns a scalar: cost per unit time. ``None`` is zero.
+      cost: L, returns a scalar: cost per unit time. Default: zero.
       controls: the admissible set of u, shape (m,). ``None``: there is no control and u has shape (0,).
 
     Keyword Args:
@@ -39,20 +39,20 @@ class Problem:
       noise: σ in dx = f dt + σ dw: a scalar ε (σ = ε I), an (n,) diagonal, an (n, k) matrix, or a function
         with the arguments of ``drift`` that returns one of these.
       discount: β ≥ 0, per unit time.
-      target: a function that is ≤ 0 inside the target, where the run ends.
-      exit_cost: paid on the target; a number or a function. ``None`` is zero.
+      target: a function that is ≤ 0 inside the target, where paths end.
+      exit_cost: the cost paid on the target; a number or a function. Default: zero.
       terminal_cost: V at the horizon, for ``march``.
-      stopping_cost: ψ, the controller may stop and pay it: V ≤ ψ.
-      running_max: g, the cost is the running maximum of g: V ≥ g. Needs zero running cost and no discount.
+      stopping_cost: ψ, which the controller may pay to stop: V ≤ ψ.
+      running_max: g, the cost is the running maximum of g: V ≥ g. Requires zero running cost and no discount.
       isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min.
-      time_dependent: whether the functions take the time as their first argument.
-      control_names, control_units: one text a control each, for pictures, as in ("torque",) and ("N m",).
-      inside: which side of its zero level is the set that the problem is about, for pictures: ``"below"`` for
-        {V ≤ 0}, ``"above"`` for {V ≥ 0}, as in ``avoid``.
+      time_dependent: True if the functions take the time as their first argument.
+      control_names, control_units: one text per control, for plots, as in ("torque",) and ("N m",).
+      inside: the side of the zero level that is the set of interest, for plots: ``"below"`` for {V ≤ 0}, ``"above"``
+        for {V ≥ 0}, as in ``avoid``.
 
     Raises:
       ValueError: an ingredient that contradicts another, or a number that is not admissible.
-      TypeError: something that is not callable where a function is wanted.
+      TypeError: an argument that must be a function and is not callable.
 
     Example:
       >>> import jax.numpy as jnp
@@ -108,10 +108,10 @@ class Problem:
         discount = _rate(discount)
         if not isinstance(time_dependent, (bool, np.bool_)):
             raise TypeError(f"Problem.time_dependent: got {time_dependent!r}, wanted True or False")
-        # of a running maximum V ≥ g the term β V − L has no meaning: there is no integral to discount
+        # with a running maximum, V ≥ g, there is no integral to discount, so β V − L has no meaning
         if running_max is not None and (cost is not None or _is_nonzero(discount)):
             raise ValueError(
-                "Problem.running_max: the cost is the running maximum alone; "
+                "Problem.running_max: the cost is only the running maximum; "
                 "leave out cost and discount, or put the running cost into a stopping_cost"
             )
         if exit_cost is not None and target is None:
@@ -134,7 +134,7 @@ class Problem:
             "control_names": words.controls,
             "control_units": words.control_units,
             "inside": words.inside,
-            # in the structure, as ``jit`` hides numbers: which certificate holds must be known while compiling
+            # static, because ``jit`` hides numbers and the certificate must be chosen while compiling
             "discounted": None if is_traced(discount) else bool(discount > 0),
         }
         for name, value in fields.items():
@@ -142,7 +142,7 @@ class Problem:
 
     @property
     def labels(self) -> Labels:
-        """The words for pictures: names and units of the controls, and the side of the level set."""
+        """The words for plots: names and units of the controls, and the side of the level set."""
         return Labels(self.control_names, self.control_units, self.inside)
 
     @property
@@ -155,7 +155,7 @@ class Problem:
         return (t,) * self.time_dependent + (x, u) + (d,) * self.is_game
 
     def state_arguments(self, x: object, t: object = 0.0) -> tuple:
-        """The arguments of the functions of the state alone, in their order."""
+        """The arguments that ``target`` and the other functions of the state take, in order."""
         return (t,) * self.time_dependent + (x,)
 
     def diffusion(self, x: State, u: Control, d: Disturbance | None = None, t: Number = 0.0) -> jax.Array:
@@ -164,19 +164,19 @@ class Problem:
         if self.noise is None:
             return jnp.zeros((n, 0))
         sigma = jnp.asarray(self.noise(*self.arguments(x, u, d, t)) if callable(self.noise) else self.noise)
-        if sigma.ndim == 0:  # one noise of strength ε on every state, independent of each other
+        if sigma.ndim == 0:  # independent noise of strength ε on every state
             return sigma * jnp.eye(n, dtype=sigma.dtype)
         return jnp.diag(sigma) if sigma.ndim == 1 else sigma
 
 
 def is_discounted(problem: Problem) -> bool | None:
-    """True if the discount is positive; None where only a run of the compiled program will tell.
+    """True if the discount is positive; None if this is known only when the compiled program runs.
 
-    A problem remembers it in its structure, so that it is known inside ``jit`` also where the number is traced.
+    A problem stores it in its structure, so it is known inside ``jit`` even if the number is traced.
     """
     if is_traced(problem.discount):
         return problem.discounted
-    return bool(np.all(np.asarray(problem.discount) > 0))  # of a batch, one a problem: all
+    return bool(np.all(np.asarray(problem.discount) > 0))  # a batch has one discount per problem: all must be positive
 
 
 def is_constrained(problem: Problem) -> bool:
@@ -185,12 +185,12 @@ def is_constrained(problem: Problem) -> bool:
 
 
 def _is_nonzero(discount: Number) -> bool:
-    """True if a discount is given: a traced one counts, as nobody traces a number that is to be left out."""
+    """True if there is a discount; a traced one counts as nonzero."""
     return is_traced(discount) or bool(discount != 0)
 
 
 def _check_sets(controls: object, disturbances: object) -> None:
-    """Refuse sets of an unknown kind; bounds without a ``Box`` around them are the usual slip."""
+    """Refuse sets of an unknown kind; a common mistake is to pass bounds without a ``Box``."""
     for name, admissible in (("controls", controls), ("disturbances", disturbances)):
         if admissible is not None and not isinstance(admissible, (Box, Ball, Finite)):
             cure = ""
@@ -200,7 +200,7 @@ def _check_sets(controls: object, disturbances: object) -> None:
 
 
 def _rate(discount: object) -> Number:
-    """The discount as a float, or the tracer that stands for it."""
+    """The discount as a float, or as a tracer."""
     rate = numbers(discount, "Problem.discount")
     if np.ndim(rate) != 0 or (isinstance(rate, np.ndarray) and not 0 <= rate < np.inf):
         raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0")
@@ -208,13 +208,13 @@ def _rate(discount: object) -> Number:
 
 
 def _noise(noise: object) -> Any:
-    """σ as a function, a number or an array; its shape and its numbers checked where they are known."""
+    """σ as a function, a number or an array; its shape and its numbers are checked if they are known."""
     sigma = _function_or_number(noise, "Problem.noise", largest=2)  # ε, (n,) or (n, k)
     if sigma is None or callable(sigma) or is_traced(sigma):
         return sigma
     if not np.all(np.isfinite(sigma)):
         raise ValueError(f"Problem.noise: got {noise!r}, wanted finite numbers")
-    # entries of a matrix may be negative: their signs say how the noises are correlated
+    # entries of a matrix may be negative: their signs set the correlation of the noises
     if np.ndim(sigma) < 2 and np.any(np.asarray(sigma) < 0):
         raise ValueError(f"Problem.noise: got {noise!r}, wanted numbers ≥ 0: it is σ in dx = f dt + σ dw")
     return sigma
@@ -230,6 +230,6 @@ def _function_or_number(value: object, name: str, largest: int = 0) -> Any:
         raise ValueError(f"{name}: got shape {np.shape(array)}, wanted {wanted}")
     if not isinstance(array, np.ndarray):
         return array
-    if np.any(np.isnan(array)):  # infinity is a cost: "never stop here", "never enter"
+    if np.any(np.isnan(array)):  # infinity is allowed: "never stop here", "never enter"
         raise ValueError(f"{name}: got {value!r}, which is not a number")
     return array if array.ndim else float(array)

@@ -1,9 +1,9 @@
-"""Frozen dataclasses that JAX can look through.
+"""Frozen dataclasses that are JAX pytrees.
 
-Fields are of three kinds: leaves (numbers and arrays: what one may sweep, batch or differentiate), static
-fields (part of the structure: what may cost a recompile) and host fields (timings, histories: dropped when
-the object is flattened, default when it is rebuilt). Rebuilding never runs ``__post_init__``: it meets
-tracers and stacked arrays, which no check of values could pass.
+Fields are of three kinds: leaves (numbers and arrays that can be swept, batched or differentiated), static fields (part
+of the structure, so a change may recompile) and host fields (timings and histories, dropped when the object is
+flattened and reset to their defaults when it is rebuilt). Rebuilding never runs ``__post_init__``, because its checks
+would fail on tracers and stacked arrays.
 """
 
 import copy
@@ -24,7 +24,7 @@ from hjbjax.problem.types import DType, Numbers
 
 P = ParamSpec("P")
 T = TypeVar("T")
-ELSEWHERE = {  # words that other packages and books have for an argument, and ours
+ELSEWHERE = {  # names of arguments in other packages and books, and the names used here
     **dict.fromkeys(("dynamics", "f", "ode", "fun"), ("drift",)),
     **dict.fromkeys(("loss", "l", "lagrangian"), ("cost",)),
     **dict.fromkeys(("gamma", "beta", "rho", "rate"), ("discount",)),
@@ -45,9 +45,9 @@ ELSEWHERE = {  # words that other packages and books have for an argument, and o
     **dict.fromkeys(("accuracy", "order", "discretization"), ("scheme",)),
     **dict.fromkeys(("solver", "algorithm"), ("method",)),
 }
-# what other public functions call, as it stands at the beginning of a refusal
+# the start of an error message of a function that other public functions call
 INNER = re.compile(r"^(lane \d+: )?(?:solve|solve_batch|march|reach_probability): ")
-REMEMBERED = 256  # answers of one function that are kept, the latest: the keys hold functions, and what these hold
+REMEMBERED = 256  # the number of most recent answers to keep per function; their keys hold functions and arrays
 
 
 @dataclass_transform(frozen_default=True, eq_default=False)
@@ -69,7 +69,7 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
     static, host = tuple(static), tuple(host)
 
     def register(cls: type[T]) -> type[T]:
-        # eq=False: a comparison field by field would ask an array for its truth
+        # eq=False: comparing field by field would need the truth value of an array
         cls = dataclasses.dataclass(frozen=True, eq=False, init="__init__" not in vars(cls))(cls)
         cls.__init__ = with_suggestions(cls.__init__, cls.__name__)  # type: ignore[method-assign]
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
@@ -87,7 +87,7 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
             return children, tuple(getattr(self, name) for name in static)
 
         def unflatten(aux, children):
-            self = object.__new__(cls)  # past __init__ and past the lock of a frozen dataclass
+            self = object.__new__(cls)  # skips __init__ and the lock of a frozen dataclass
             for name, value in (*zip(leaves, children, strict=True), *zip(static, aux, strict=True)):
                 object.__setattr__(self, name, value)
             for name, make in defaults.items():
@@ -101,9 +101,9 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
 
 
 def with_suggestions(function: Callable[P, T], name: str | None = None) -> Callable[P, T]:
-    """Decorator: a misspelt keyword is refused with the one that it is next to, or with all that there are.
+    """Decorator: an unknown keyword is refused with the closest known keyword, or with the list of all keywords.
 
-    A function that hands further keywords on leaves that to whom it hands them.
+    A function with ``**kwargs`` is returned unchanged; the function that receives them checks them.
     """
     by_name = keywords(function)
     if by_name is None:
@@ -118,9 +118,9 @@ def with_suggestions(function: Callable[P, T], name: str | None = None) -> Calla
 
 
 def front_door(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator of a public function: with the package's own options of JAX, and with ``with_suggestions``.
+    """Decorator of a public function: sets the package's JAX options and adds ``with_suggestions``.
 
-    A refusal of ``solve`` or ``march`` that the function called begins with the name of the function.
+    If ``solve`` or ``march`` raises inside the function, the message begins with the name of the outer function.
     """
 
     @functools.wraps(function)
@@ -136,13 +136,13 @@ def front_door(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _rename(refusal: Exception, caller: str) -> None:
-    """Let the message of a refusal begin with the function that the user called, in place."""
+    """Replace, in place, the function named at the start of an error message by the function the user called."""
     if refusal.args and isinstance(refusal.args[0], str):
         refusal.args = (INNER.sub(rf"\1{caller}: ", refusal.args[0], count=1), *refusal.args[1:])
 
 
 def keywords(function: Callable) -> Set[str] | None:
-    """The keywords of a function; None where it hands further ones on."""
+    """The keywords of a function; None if it has ``**kwargs``."""
     parameters = inspect.signature(function).parameters.values()
     if any(each.kind is each.VAR_KEYWORD for each in parameters):
         return None
@@ -150,11 +150,11 @@ def keywords(function: Callable) -> Set[str] | None:
 
 
 def refuse_misspelt(words: Iterable[str], by_name: Set[str], function: str) -> None:
-    """Refuse the first of the words that is no keyword of a function, with the one that it is next to."""
+    """Refuse the first word that is not a keyword of a function, and suggest the closest keyword."""
     for word in words:
         if word in by_name:
             continue
-        # running_cost is the cost, though more like running_max
+        # running_cost means cost, although its spelling is closer to running_max
         parts = [part for part in word.split("_")[::-1] if part in by_name]
         elsewhere = [own for own in ELSEWHERE.get(word.lower(), ()) if own in by_name]
         near = parts or elsewhere or difflib.get_close_matches(word, by_name)
@@ -163,7 +163,7 @@ def refuse_misspelt(words: Iterable[str], by_name: Set[str], function: str) -> N
 
 
 def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:
-    """Make choices without numbers equal when their fields are: as static arguments they must not recompile."""
+    """Make objects without leaves equal if their fields are equal; as static arguments they then do not recompile."""
 
     def key(self):
         return tuple(getattr(self, name) for name in names)
@@ -178,7 +178,7 @@ def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:
 
 
 def _default(field: dataclasses.Field) -> Callable[[], Any]:
-    """A function that makes the default of a field, a new one each time as dictionaries may be written to."""
+    """A function that makes the default of a field, a new one each time because dictionaries are mutable."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory
     if field.default is dataclasses.MISSING:
@@ -192,15 +192,15 @@ def is_traced(*trees: Any) -> bool:
 
 
 def known(number: Any) -> Any:
-    """The number, or the array, in NumPy unless it is traced: every operation on JAX arrays is a program to compile."""
+    """The number or array in NumPy unless it is traced, because JAX compiles a program for every operation."""
     return number if is_traced(number) else np.asarray(number)
 
 
 def remembered(function: Callable[..., T]) -> Callable[..., T]:
-    """Decorator that keeps answers by the first argument, a pytree, with the numbers in it; while traced asks anew.
+    """Decorator that caches results by the first argument, a pytree, including its numbers.
 
-    For facts read off a trace of a function of the user's: tracing costs more than a small solve. The other arguments
-    must be hashable; only answers are kept, no exceptions.
+    For properties that require tracing a user's function, which costs more than a small solve. The other arguments must
+    be hashable. Calls with traced arguments and exceptions are not cached.
     """
     answers: dict[Any, T] = {}
 
@@ -212,7 +212,7 @@ def remembered(function: Callable[..., T]) -> Callable[..., T]:
         key = (structure, tuple(map(_digest, leaves)), arguments, tuple(options.items()))
         if key not in answers:
             answers[key] = function(tree, *arguments, **options)
-            if len(answers) > REMEMBERED:  # dictionaries keep the order of insertion: the oldest goes
+            if len(answers) > REMEMBERED:  # dictionaries keep the order of insertion, so the first is the oldest
                 del answers[next(iter(answers))]
         return answers[key]
 
@@ -220,10 +220,10 @@ def remembered(function: Callable[..., T]) -> Callable[..., T]:
 
 
 def as_one_program(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator of a function of pytrees that hold tracers: one compiled program, and one more for its derivative.
+    """Decorator of a function of pytrees with tracers: one compiled program, and one more for its derivative.
 
-    ``grad`` and ``vmap`` without ``jit`` compile and run operation by operation. Numbers that are known stay known,
-    those that come back as well, and belong to the program; the tracers are its arguments.
+    ``grad`` and ``vmap`` without ``jit`` compile and run operation by operation. Here only the tracers are arguments of
+    the program. Known numbers, including those in the result, are constants of the program.
     """
 
     @jax.jit
@@ -240,10 +240,10 @@ def as_one_program(function: Callable[P, T]) -> Callable[P, T]:
 
 @jax.custom_jvp
 def tie(tree: Any) -> Any:
-    """The same tree behind one barrier, so that XLA hoists nothing computed from it out of a loop if one leaf varies.
+    """The same tree behind one barrier, so that XLA does not hoist computations from a loop if one leaf varies.
 
-    Tangents pass without a barrier. JAX 0.12 cannot transpose a barrier of linear and constant tangents together, and a
-    rule of ``jax.custom_jvp`` makes both: the tangent of what does not move is an array of zeros there.
+    Tangents pass without a barrier: JAX 0.12 cannot transpose a barrier of linear and constant tangents together, and a
+    ``jax.custom_jvp`` rule has both, since the tangent of a constant is an array of zeros there.
     """
     return jax.lax.optimization_barrier(tree)
 
@@ -255,7 +255,7 @@ def _tie_tangent(primals: tuple, tangents: tuple) -> tuple:
 
 @jax.tree_util.register_pytree_node_class
 class _PartlyTraced:
-    """A pytree whose leaves are the tracers in another one; the numbers that are known belong to its structure."""
+    """A pytree whose leaves are the tracers of another tree; the known numbers belong to its structure."""
 
     def __init__(self, known: "_Known", traced: Iterable[Any]):
         self.known, self.traced = known, tuple(traced)
@@ -281,7 +281,7 @@ class _PartlyTraced:
 
 
 class _Known:
-    """The structure of a tree and some of its leaves, equal to another by the bits of the numbers."""
+    """The structure of a tree and some of its leaves; equal to another if the bits of the numbers are equal."""
 
     def __init__(self, structure: Any, leaves: tuple):
         self.structure, self.leaves = structure, leaves
@@ -296,34 +296,34 @@ class _Known:
 
 def _digest(leaf: Numbers) -> tuple[Any, ...]:
     """Type, shape, dtype and a digest of the bits of a leaf: equal for equal leaves."""
-    array = np.ascontiguousarray(leaf)  # bits, as NaN equals no NaN and every look would be new
+    array = np.ascontiguousarray(leaf)  # compare bits, because NaN is not equal to NaN
     return type(leaf), array.shape, array.dtype, hashlib.blake2b(array.tobytes(), digest_size=16).digest()
 
 
 def numbers(value: object, name: str) -> Any:
-    """``value`` as its own float64 array while it is concrete; a tracer, or a list that holds one, as a tracer."""
-    # float64 whatever JAX is set to: a solve casts to its own dtype later, and grids compare corners before
+    """A float64 copy of concrete numbers; tracers, and lists that contain one, stay traced."""
+    # float64 for any JAX setting: a solve casts to its own dtype later, and grids compare corners before that
     if is_traced(value) and isinstance(value, (jax.core.Tracer, Sequence)):
         return jax.numpy.asarray(value)
     try:
         if np.asarray(value).dtype.kind in "USc":  # NumPy would parse "1.0" and drop imaginary parts
             raise TypeError
-        return np.array(value, dtype=np.float64)  # a copy: what the caller does to the original later is no concern
+        return np.array(value, dtype=np.float64)  # a copy, so that later changes of the original have no effect
     except (TypeError, ValueError):
         raise TypeError(f"{name}: got {value!r}, wanted numbers") from None
 
 
 def as_partial(function: Callable | None, name: str = "function") -> jax.tree_util.Partial | None:
-    """A callable as a pytree: a bound method of a registered dataclass brings the fields along as leaves.
+    """A callable as a pytree: a bound method of a registered dataclass has the fields of the dataclass as leaves.
 
-    So does a callable that is itself a pytree, such as a registered dataclass with a ``__call__``.
+    A callable that is itself a pytree, such as a registered dataclass with a ``__call__``, has its own leaves.
     """
     if function is None or isinstance(function, jax.tree_util.Partial):
         return function
     if not callable(function):
         raise TypeError(f"{name}: got {function!r}, wanted a function of one state")
-    # The function of a Partial belongs to the tree's structure, so it is the one of the class, equal for all objects;
-    # the object with its numbers is an argument. A bound method in its place would compile anew for every object.
+    # the function of a Partial belongs to the structure, so use the function of the class, which is equal for all
+    # objects, and pass the object as an argument; a bound method would recompile for every object
     if not jax.tree_util.all_leaves([function]):
         return jax.tree_util.Partial(type(function).__call__, function)
     owner = getattr(function, "__self__", None)
@@ -333,7 +333,7 @@ def as_partial(function: Callable | None, name: str = "function") -> jax.tree_ut
 
 
 def altered(tree: T, **fields: Any) -> T:
-    """A copy with other fields and without the checks that ``dataclasses.replace`` would run on tracers."""
+    """A copy with changed fields and without the checks of ``dataclasses.replace``, which would fail on tracers."""
     result = copy.copy(tree)  # shallow, and without __init__
     for name, value in fields.items():
         object.__setattr__(result, name, value)
@@ -341,23 +341,23 @@ def altered(tree: T, **fields: Any) -> T:
 
 
 def as_jax(tree: T) -> T:
-    """The tree with NumPy's numbers as JAX's arrays, in the widest type that JAX is set to.
+    """The tree with NumPy numbers as JAX arrays, in the widest type that JAX is set to.
 
-    For arguments of a compiled function inside a trace: JAX 0.10 confuses a program that took NumPy's float64 in a
-    trace of 64 bits with one of 32.
+    For arguments of a compiled function inside a trace: JAX 0.10 confuses a program that took NumPy float64 numbers in
+    a 64-bit trace with a 32-bit program.
     """
 
     def convert(leaf):
         if not isinstance(leaf, (np.ndarray, np.generic)):
             return leaf
-        # with the type said: without it JAX hands out what it once made of the very array, in the other precision
+        # with an explicit type; otherwise JAX may return its cached copy of the array in the other precision
         return jax.numpy.asarray(leaf, jax.numpy.result_type(leaf))
 
     return jax.tree.map(convert, tree)
 
 
 def cast(tree: T, dtype: DType) -> T:
-    """The tree with its floating-point leaves in ``dtype``; integers and booleans as they are."""
+    """The tree with its floating-point leaves in ``dtype``; integers and booleans are unchanged."""
 
     def convert(leaf):
         if not jax.numpy.issubdtype(jax.numpy.result_type(leaf), jax.numpy.floating):

@@ -1,7 +1,7 @@
 """Admissible sets of controls and disturbances.
 
-``Box`` and ``Ball`` are continua and are minimised as continua; ``Finite`` is enumerated. The numbers in a
-set are leaves: a wider box is no recompile.
+``Box`` and ``Ball`` are continuous sets and are minimised over as such; ``Finite`` is enumerated. The numbers in a set
+are leaves, so a wider box does not recompile.
 """
 
 import itertools
@@ -14,11 +14,11 @@ import numpy as np
 from hjbjax.problem.pytree import known, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, DType, Number
 
-SLACK = 1e-6  # of the size of a set: eight roundings of float32, in which a control outside it may have been made
+SLACK = 1e-6  # relative to the size of a set: eight roundings of float32, in which a control may have been computed
 
 
 def _finite_numbers(value: object, name: str) -> Array:
-    """Numbers as an array, refused where they are not finite: over an unbounded set H may be −∞ at every state."""
+    """Numbers as an array; refused if not finite, because H may be −∞ everywhere over an unbounded set."""
     array = numbers(value, name)
     if isinstance(array, np.ndarray) and not np.all(np.isfinite(array)):
         raise ValueError(f"{name}: got {value!r}, wanted finite numbers: bound the set")
@@ -26,7 +26,7 @@ def _finite_numbers(value: object, name: str) -> Array:
 
 
 def _is_count(value: object) -> bool:
-    """True if a value is a positive integer; True is none."""
+    """True if a value is a positive integer; booleans do not count."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and int(value) >= 1
 
 
@@ -35,8 +35,8 @@ class Box:
     """The box lo ≤ u ≤ hi.
 
     Args:
-      lo: lower bounds, shape (m,), in the units of each input; of one input, a number will do.
-      hi: upper bounds, likewise.
+      lo: lower bounds, shape (m,), in the units of each input; for one input, a number is enough.
+      hi: upper bounds, in the same form.
 
     Raises:
       ValueError: the bounds differ in length, are not finite, or leave no admissible control.
@@ -53,7 +53,7 @@ class Box:
         if self.hi is None:
             pair = np.shape(self.lo) == (2,)
             cure = f"Box({self.lo[0]!r}, {self.lo[1]!r})" if pair else "Box([-1.0], [1.0])"
-            raise TypeError(f"Box: got lo = {self.lo!r} alone, wanted both bounds, as in hjb.{cure}")
+            raise TypeError(f"Box: got only lo = {self.lo!r}, wanted both bounds, as in hjb.{cure}")
         lo, hi = _finite_numbers(self.lo, "Box.lo"), _finite_numbers(self.hi, "Box.hi")
         if np.ndim(lo) == np.ndim(hi) == 0:
             lo, hi = lo.reshape(1), hi.reshape(1)
@@ -71,16 +71,16 @@ class Box:
         return np.shape(self.lo)[-1]
 
     def grid(self, num: int | Sequence[int]) -> "Finite":
-        """The box sampled with ``num`` equally spaced values an input, ends included, as a finite set.
+        """The box sampled with ``num`` equally spaced values per input, including the ends, as a finite set.
 
-        Values are (lo·(M−k) + hi·k)/M, so that an odd number on a symmetric box holds an exact zero.
+        Values are (lo·(M−k) + hi·k)/M, so that an odd number on a symmetric box includes an exact zero.
         """
         counts = tuple(num) if isinstance(num, (Sequence, np.ndarray)) else (num,) * self.dim
         if len(counts) != self.dim or not all(_is_count(n) for n in counts):
             raise ValueError(f"Box.grid: got {num!r}, wanted a positive integer or {self.dim} of them")
         # indices k, shape (K, m), in the order of nested loops: the last input changes fastest
         rows = np.array(list(itertools.product(*(range(int(n)) for n in counts))), dtype=np.float64)
-        last = np.maximum(np.asarray(counts, dtype=np.float64) - 1, 1)  # one value alone is lo, not 0/0
+        last = np.maximum(np.asarray(counts, dtype=np.float64) - 1, 1)  # a single value is lo, not 0/0
         return Finite((known(self.lo) * (last - rows) + known(self.hi) * rows) / last)
 
 
@@ -89,7 +89,7 @@ class Ball:
     """The Euclidean ball |u| ≤ radius in R^dim.
 
     Args:
-      radius: in the units of the inputs, which are the same for all; at least 0.
+      radius: at least 0, in the units of the inputs, which must all be the same.
       dim: the number of inputs m.
 
     Raises:
@@ -113,7 +113,7 @@ class Ball:
 
 @pytree_dataclass()
 class Finite:
-    """A finite set; enumerated, in order, the first of equals wins.
+    """A finite set, enumerated in order; the first of several equally good points wins.
 
     Args:
       points: the K admissible values, shape (K, m).
@@ -126,8 +126,8 @@ class Finite:
 
     def __post_init__(self):
         points = _finite_numbers(self.points, "Finite.points")
-        if np.ndim(points) == 1 and np.size(points) > 0:  # three numbers: three controls, or one of three inputs?
-            raise ValueError(f"Finite: got points of shape {np.shape(points)}, wanted (K, m): one row a control")
+        if np.ndim(points) == 1 and np.size(points) > 0:  # ambiguous: three controls, or one control of three inputs
+            raise ValueError(f"Finite: got points of shape {np.shape(points)}, wanted (K, m): one row per control")
         if np.ndim(points) != 2 or 0 in np.shape(points):
             raise ValueError(f"Finite: no admissible control: got points of shape {np.shape(points)}, wanted (K, m)")
         object.__setattr__(self, "points", points)
@@ -142,10 +142,10 @@ AdmissibleSet: TypeAlias = Box | Ball | Finite
 
 
 def samples(admissible: AdmissibleSet, budget: int) -> Array:
-    """Representative points of a set, shape (K, m) with K about ``budget``; all points of a finite one.
+    """Representative points of a set, shape (K, m) with K about ``budget``; all points of a finite set.
 
-    A box gets an odd number of values an input, so that its ends and its middle are among them; a ball its
-    centre and directions on two spheres, at equal angles in the plane and along axes and diagonals beyond.
+    A box has an odd number of values per input, so that its ends and its middle are included. A ball has its centre and
+    directions on two spheres, at equal angles in the plane and along axes and diagonals in higher dimensions.
     """
     if isinstance(admissible, Finite):
         return admissible.points
@@ -165,19 +165,19 @@ def _unit_ball(dim: int, budget: int) -> np.ndarray:
     """Points of the unit ball, shape (K, dim)."""
     if dim == 1:  # an odd number of points, so that −1, 0 and 1 are among them
         return np.linspace(-1.0, 1.0, budget // 2 * 2 + 1)[:, None]
-    if dim == 2:  # half of the budget a circle, by fours so that the axes are among the directions
+    if dim == 2:  # half of the budget per circle, in multiples of four so that the axes are among the directions
         angles = np.arange(max(8, budget // 8 * 4)) * (2 * np.pi / max(8, budget // 8 * 4))
         sphere = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    else:  # 3^dim − 1 directions whatever the budget: 26, 80, 242, ...
+    else:  # 3^dim − 1 directions for any budget: 26, 80, 242, ...
         signs = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=dim)))
         signs = signs[np.any(signs != 0, axis=1)]
         sphere = signs / np.linalg.norm(signs, axis=1, keepdims=True)
-    # centre, half way and rim: the size |u| of any control is within ¼ of some sample's
+    # centre, half way and rim: the size |u| of any control is within ¼ of some sample's size
     return np.concatenate([np.zeros((1, dim)), 0.5 * sphere, sphere])
 
 
 def holds(admissible: AdmissibleSet, u: Array) -> np.ndarray:
-    """True for each control (..., m) that lies in a set of known numbers, up to rounding in float32; shape (...)."""
+    """True for each control (..., m) inside a set of known numbers, up to rounding in float32; shape (...)."""
     if isinstance(admissible, Box):
         lo, hi = np.asarray(admissible.lo), np.asarray(admissible.hi)
         slack = SLACK * np.maximum(np.maximum(np.abs(lo), np.abs(hi)), hi - lo)
@@ -190,30 +190,30 @@ def holds(admissible: AdmissibleSet, u: Array) -> np.ndarray:
 
 
 def extremes(admissible: AdmissibleSet) -> Array:
-    """Points whose convex hull holds the set, shape (K, m): where a convex function of u is at its largest."""
+    """Points whose convex hull contains the set, shape (K, m): a bound for the maximum of a convex function of u."""
     if isinstance(admissible, Finite):
         return admissible.points
     if isinstance(admissible, Box):
         return admissible.grid(2).points
-    # the corners of the cube around the ball, 2^m of them: no polytope inside the ball would do
+    # the 2^m corners of the cube around the ball, because no polytope inside the ball contains it
     return admissible.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=admissible.dim)))
 
 
 def probes(admissible: AdmissibleSet | None, dtype: DType) -> list[list]:
-    """Actions, lists of m numbers, among which a convex function of u is at its largest; a few more for others."""
+    """Actions, lists of m numbers, that bound the maximum of a convex function of u, plus a few samples."""
     if admissible is None:
-        return [[]]  # one action that has no entries, so that loops over actions still run once
+        return [[]]  # one action without entries, so that loops over actions run once
     points = jnp.asarray(extremes(admissible), dtype)
     if not isinstance(admissible, Finite):
-        # a function that is not convex may be larger inside; samples are no proof, and cost little
+        # a function that is not convex may be larger inside; samples prove nothing, but cost little
         points = jnp.concatenate([points, jnp.asarray(samples(admissible, 9), dtype)])
     return [[points[k, j] for j in range(points.shape[1])] for k in range(points.shape[0])]
 
 
 def spacing(admissible: AdmissibleSet, budget: int) -> list[Number]:
-    """The distance between neighbouring ``samples``, one number an input."""
+    """The distance between neighbouring ``samples``, one number per input."""
     if isinstance(admissible, Ball):
-        return [admissible.radius / 2] * admissible.dim  # from the centre to the half-way sphere and on to the rim
+        return [admissible.radius / 2] * admissible.dim  # from the centre to the half-way sphere, and on to the rim
     assert isinstance(admissible, Box)
     per_input = _values_an_input(admissible, budget)
     return [(admissible.hi[j] - admissible.lo[j]) / (per_input - 1) for j in range(admissible.dim)]

@@ -1,8 +1,8 @@
-"""Standard output and standard error as a program may really have them: missing, closed, full, or not a terminal.
+"""Standard output and standard error that may be missing, closed, full, or not a terminal.
 
 ``sys.stderr`` is None under ``pythonw``, in some services and after ``2>&-``. Notebooks, editors and test runners
-replace it by objects of their own, which may lack ``isatty`` or raise when they are written to. Losing what the package
-shows there is better than losing a solve. ``encodable`` and ``plain`` make text that a stream can show.
+replace it by objects that may lack ``isatty`` or raise when written to. It is better to lose the output than to lose a
+solve. ``encodable`` and ``plain`` make text that a stream can show.
 """
 
 import contextlib
@@ -11,8 +11,8 @@ import sys
 import warnings
 from typing import Any
 
-LONGEST = 2000  # characters of a text that are shown; wrapping a million takes a second
-SPELLED = {  # where the encoding lacks the letter
+LONGEST = 2000  # characters of a text to show; wrapping a million takes a second
+SPELLED = {  # replacements for characters that the encoding lacks
     **{"−": "-", "–": "-", "—": "-", "≤": "<=", "≥": ">=", "∞": "inf", "·": "*", "×": "x", "→": "->", "±": "+-"},
     **{"²": "^2", "½": "1/2", "Δ": "d", "∂": "d", "Σ": "sum ", "“": '"', "”": '"', "‘": "'", "’": "'", "…": "..."},
     **{"α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "ε": "eps", "η": "eta", "θ": "theta", "κ": "kappa"},
@@ -21,16 +21,16 @@ SPELLED = {  # where the encoding lacks the letter
 
 
 def is_terminal(stream: Any) -> bool:
-    """True if a stream is a terminal that can be written to; False for every other object, None included."""
+    """True if a stream is a terminal that can be written to; False for every other object, including None."""
     try:
         stream.write("")
         return bool(stream.isatty())
-    except Exception:  # a closed file raises ValueError, None AttributeError, a stand-in anything
+    except Exception:  # a closed file raises ValueError, None AttributeError, a replacement object anything
         return False
 
 
 def is_open(stream: Any) -> bool:
-    """True if a stream accepts text; True on a full disk and in a pipe without a reader, too."""
+    """True if a stream accepts text; also True on a full disk and in a pipe without a reader."""
     try:
         stream.write("")
     except OSError:
@@ -41,7 +41,7 @@ def is_open(stream: Any) -> bool:
 
 
 def encoding_of(stream: Any) -> str:
-    """The name of a stream's encoding; UTF-8 for a stream that does not say."""
+    """The name of a stream's encoding; UTF-8 by default."""
     try:
         encoding = stream.encoding
     except Exception:  # a detached stream raises ValueError, None AttributeError
@@ -50,7 +50,7 @@ def encoding_of(stream: Any) -> str:
 
 
 class Expendable:
-    """A text stream whose errors are dropped, for output that nobody must miss.
+    """A text stream that ignores errors, for output that is not essential.
 
     Args:
       stream: the stream.
@@ -60,10 +60,10 @@ class Expendable:
         self._stream, self.encoding = stream, encoding_of(stream)
 
     def write(self, text: str) -> int:
-        """Write a text if the stream accepts it; the number of its characters.
+        """Write a text if the stream accepts it, and return the number of its characters.
 
         Raises:
-          TypeError: bytes, by which some libraries find out whether a stream is one of text.
+          TypeError: bytes, with which some libraries test whether a stream is a text stream.
         """
         if not isinstance(text, str):
             raise TypeError(f"write() argument must be str, not {type(text).__name__}")
@@ -82,7 +82,7 @@ class Expendable:
 
 
 def warn(message: str, category: type[Warning] = UserWarning, stacklevel: int = 1) -> None:
-    """``warnings.warn``, without an exception where standard error cannot be written.
+    """``warnings.warn``, without an exception if standard error cannot be written to.
 
     Raises:
       Warning: a filter turns this warning into an error.
@@ -90,15 +90,15 @@ def warn(message: str, category: type[Warning] = UserWarning, stacklevel: int = 
     try:
         warnings.warn(message, category, stacklevel=stacklevel + 1)
     except Exception as error:
-        # Python drops an OSError itself; a letter that the stream cannot encode is a UnicodeError
+        # Python drops an OSError itself; a character that the stream cannot encode is a UnicodeError
         if isinstance(error, Warning) or (is_open(sys.stderr) and not isinstance(error, UnicodeError)):
             raise
 
 
 def let_go(stream: Any) -> None:
-    """Send what is left in the buffer of a stream nowhere, otherwise the interpreter fails on it again when it ends."""
+    """Discard the buffer of a stream, otherwise the interpreter fails on it again at exit."""
     with contextlib.suppress(Exception):
-        # the descriptor is replaced below Python: closing the stream would flush it and fail once more
+        # replace the descriptor below Python, because closing the stream would flush it and fail again
         handle = stream.fileno()
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, handle)
@@ -109,10 +109,10 @@ def let_go(stream: Any) -> None:
 
 
 def encodable(text: str, stream: Any = None) -> str:
-    """A text in the letters that a stream, by default standard output, can encode; others are spelled out."""
+    """A text in characters that a stream, by default standard output, can encode; other characters are spelled out."""
     encoding = encoding_of(sys.stdout if stream is None else stream)
     try:
-        text.encode(encoding)  # a Windows console may know 256 letters, and print would raise in the middle of a screen
+        text.encode(encoding)  # a Windows console may support 256 characters, and print would raise halfway
     except UnicodeEncodeError:
         return "".join(_spell(letter, encoding) for letter in text)
     except LookupError:  # an encoding that Python does not know
@@ -121,7 +121,7 @@ def encodable(text: str, stream: Any = None) -> str:
 
 
 def _spell(letter: str, encoding: str) -> str:
-    """A letter as it is if the encoding has it, else its name, else its code point."""
+    """A character itself if the encoding has it, else its name, else its code point."""
     try:
         letter.encode(encoding)
     except UnicodeEncodeError:

@@ -1,6 +1,6 @@
-"""How a problem's functions of one state are read, and what is found in them before anything runs.
+"""Tracing of a problem's functions of one state: evaluation on a grid, and analysis and checks before a solve.
 
-A function is evaluated on a whole grid component by component: ``components``, by an ``interpreter`` with the rules of
-``jaxprs`` and with indices that ``indices`` looks after. ``dependence`` reads off its jaxpr what it depends on,
-``closures`` what it sees from outside, and ``checks`` refuses what one state shows.
+``components`` evaluates a function on a whole grid component by component, by an ``interpreter`` with the rules of
+``jaxprs`` and ``stacks``. ``dependence`` finds how a function depends on the control, ``closures`` and ``outside`` find
+what it reads from outside, ``indices`` finds indices out of range, and ``checks`` refuses unsuitable functions.
 """

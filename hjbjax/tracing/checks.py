@@ -1,6 +1,6 @@
-"""What a problem must satisfy before a solve starts, seen on one state; host level, never under a tracer.
+"""Checks of a problem on one state before a solve starts; on the host, never under a tracer.
 
-Every function is traced once and nothing is allocated. What is refused is named, with the way out.
+Every function is traced once and nothing is allocated. Messages name the fault and the remedy.
 """
 
 import inspect
@@ -24,39 +24,39 @@ from hjbjax.tracing.operations import Operations, operations
 OF_ACTION = ("drift", "cost", "noise")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
 
-_ADVICE = (  # most special first: a TracerBoolConversionError is a ConcretizationTypeError, too
+_ADVICE = (  # most specific first, since TracerBoolConversionError is a ConcretizationTypeError
     (
         (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError),
         "decides by Python `if`, `and`, `min`, `max` or a mask on a traced value: use jnp.where (jnp.minimum, ...)",
     ),
-    (jax.errors.TracerArrayConversionError, "hands a traced value to NumPy: use jnp in place of np"),
+    (jax.errors.TracerArrayConversionError, "passes a traced value to NumPy: use jnp instead of np"),
     (jax.errors.TracerIntegerConversionError, "indexes by a traced value: use jnp.asarray(table)[i]"),
     (
         jax.errors.ConcretizationTypeError,
-        "needs a traced value as a number: use jnp in place of np, math, float() and int(), and jnp.where for `if`",
+        "needs a traced value as a number: use jnp instead of np, math, float() and int(), and jnp.where for `if`",
     ),
 )
 
-_SLIPS = (  # of shapes: words of JAX's, and what most likely led to them
-    ("annot stack arrays", "u and d are arrays, also of one entry: u[0] is the number"),
-    ("must have the same shape", "u and d are arrays, also of one entry: u[0] is the number"),
+_SLIPS = (  # common mistakes with shapes: JAX's words, and the most likely reason
+    ("annot stack arrays", "u and d are arrays, even with a single entry: u[0] is the number"),
+    ("must have the same shape", "u and d are arrays, even with a single entry: u[0] is the number"),
     ("Too many indices", "x is one state, without an axis for a batch: x[0] is its first entry"),
     ("setting an array element", "nothing traced can be written into a NumPy array: use jnp.stack([...])"),
 )
 
 
 def cure(error: Exception) -> str | None:
-    """What a function did that JAX cannot trace, and what to write instead; ``None`` for errors of another kind."""
+    """The reason why JAX cannot trace a function, and the remedy; ``None`` for errors of another kind."""
     return next((advice for kind, advice in _ADVICE if isinstance(error, kind)), None)
 
 
 def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
-    """Refuse functions that cannot be traced on one state or return something else than they should.
+    """Refuse functions that cannot be traced on one state or return the wrong kind of result.
 
     Args:
       problem: the problem.
-      grid: the grid; only its number of axes and their points matter.
-      scheme: the scheme; one with a number ``points`` needs as many points an axis.
+      grid: the grid; only its number of axes and points is used.
+      scheme: the scheme; every axis needs at least ``scheme.points`` points.
 
     Raises:
       ValueError: a result of the wrong shape or kind, a wrong number of arguments, code that JAX cannot trace.
@@ -68,37 +68,37 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
     n = grid.ndim
     of_one_state(problem, n, "the number of axes of the grid")
     if problem.noise is not None:
-        # σ of shape (n, k), whose transitions go along diagonals
+        # σ of shape (n, k), with transitions along diagonals
         with own_settings(x64=True):
             if len(_shape_or_fault(problem, "noise", n)) == 2:
                 refuse_stretched(grid)
 
 
 def refuse_stretched(grid: Grid) -> None:
-    """Refuse correlated noise, σ of shape (n, k), on a stretched grid: its diagonal jumps want equal spacings."""
+    """Refuse correlated noise, σ of shape (n, k), on a stretched grid: diagonal jumps require equal spacings."""
     if grid.ndim > 1 and any(each is not None for each in grid.stretch):
         raise ValueError(
-            "noise: correlated noise, σ of shape (n, k), wants equal spacings: leave out Grid.stretch, or give noise "
-            "by axis, (n,)"
+            "noise: correlated noise, σ of shape (n, k), requires equal spacings: leave out Grid.stretch, or give "
+            "noise by axis, (n,)"
         )
 
 
 def of_one_state(problem: Problem, n: int, meaning: str) -> None:
-    """Refuse functions that cannot be traced on a state of ``n`` numbers or return something else than they should.
+    """Refuse functions that cannot be traced on a state of ``n`` numbers or return the wrong kind of result.
 
     Args:
       problem: the problem.
       n: the number of states.
-      meaning: what n is, for refusals.
+      meaning: the meaning of n, for messages.
 
     Raises:
-      ValueError: as ``shapes``.
+      ValueError: as for ``shapes``.
     """
 
     def expect(name: str, wanted: str, fits: Callable[[tuple], bool]) -> None:
         _expect(problem, name, n, wanted, fits, "a scalar" if wanted == "()" else f"n = {n} is {meaning}")
 
-    # answers are remembered, so they must not depend on the precision that JAX is set to when first asked
+    # results are cached, so they must not depend on the precision that JAX is set to at the first call
     with own_settings(x64=True):
         expect("drift", f"({n},)", lambda shape: shape == (n,))
         expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
@@ -107,22 +107,22 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
 
 
 def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
-    """Refuse an endless sum of costs: no discount, and nothing that ends the path or lets it rest at no cost.
+    """Refuse an infinite sum of costs: no discount, and nothing that ends the path or lets it rest at no cost.
 
     Args:
       problem: the problem.
-      has_rest: whether there is a node where the system can rest at no cost.
-      grid: the nodes; where none stands in the middle of the box, the refusal says which shape puts one there.
+      has_rest: True if there is a node where the system can rest at no cost.
+      grid: the nodes; if none is in the middle of the box, the message suggests a shape with a node there.
 
     Raises:
-      ValueError: there is no finite solution; with what would give one.
+      ValueError: there is no finite solution; the message lists remedies.
     """
-    # with any of these the costs of a path may be finite; whether they are, the solve will find out
+    # with any of these the cost of a path may be finite; the solve will find out
     ends = (problem.target, problem.stopping_cost, problem.running_max)
     if problem.discount > 0 or has_rest or any(end is not None for end in ends):
         return
     raise ValueError(
-        "Problem: there is no finite solution: discount = 0, and the cost is paid for ever, since there is no target,\n"
+        "Problem: there is no finite solution: discount = 0, and the cost accumulates forever: there is no target,\n"
         "no stopping_cost, no running_max and no node where the system can rest at no cost.\n"
         "Give discount > 0, or a target, or put a rest point (drift 0 and cost 0 for some control) on a node,\n"
         "or march over a finite horizon" + _middle(grid)
@@ -135,9 +135,9 @@ def _middle(grid: Grid) -> str:
         count - (count % 2 if cyclic else 1 - count % 2)
         for count, cyclic in zip(grid.shape, grid.periodic, strict=True)
     )
-    if shape == grid.shape or min(shape) < 2:  # one stands there already, or an axis of two points would lose one
+    if shape == grid.shape or min(shape) < 2:  # a node is there already, or an axis of two points would lose one
         return ""
-    return f".\nNo node stands in the middle of the box, as in 0 on [-1, 1]; shape={shape} puts one there"
+    return f".\nNo node is in the middle of the box, such as 0 on [-1, 1]; shape={shape} puts one there"
 
 
 # --- on one state ---
@@ -163,7 +163,7 @@ def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tu
     if ingredient is None:
         return
     verdict = _shape_or_fault(problem, name, n)
-    if isinstance(verdict, str):  # the commonest slips get the way out as well
+    if isinstance(verdict, str):  # the most common mistakes get advice
         hint = ""
         if verdict.startswith(("a list", "a tuple")) and wanted != "()":
             hint = ": use jnp.stack([...])"
@@ -177,13 +177,13 @@ def _expect(problem: Problem, name: str, n: int, wanted: str, fits: Callable[[tu
 
 
 def _shape_or_fault(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
-    """The shape of an ingredient, or of its result if it is a function; of other than numbers a description."""
+    """The shape of an ingredient, or of its result if it is a function; a description if it is not numeric."""
     ingredient = getattr(problem, name)
     return _probe(problem, name, n) if callable(ingredient) else _verdict(ingredient)
 
 
 def _verdict(result: Any) -> tuple[int, ...] | str:
-    """The shape of floating-point numbers; of anything else a description."""
+    """The shape of floating-point numbers; a description of anything else."""
     if result is None or isinstance(result, str):
         return repr(result)
     if isinstance(result, (list, tuple, dict)):
@@ -201,30 +201,30 @@ def _verdict(result: Any) -> tuple[int, ...] | str:
 
 
 def _probe(problem: Problem, name: str, n: int) -> tuple[int, ...] | str:
-    """The shape of a function's result on one state, found by tracing it, or a description of what it is instead."""
+    """The shape of a function's result on one state, found by tracing it, or a description if it is not numeric."""
     names, lengths = _names(problem, name), _lengths(problem, n)
     _check_arity(problem, name)
     return _probed(getattr(problem, name), {letter: lengths[letter] for letter in names}, call(problem, name))
 
 
 def _probed(function: Callable, fed: Mapping[str, tuple[int, ...]], said_call: str) -> tuple[int, ...] | str:
-    """As ``_probe``, by the shapes of the arguments, and as refusals call it."""
-    # any exception may come out of a function of the user's: those of JAX get advice, those of shapes their first line
+    """``_probe`` for given shapes of the arguments and a given name for messages."""
+    # a user's function may raise anything: JAX's errors get advice, errors about shapes are quoted
     try:
         verdict, outside, *_ = _trace_once(function, tuple(fed), tuple(fed.values()))
     except Exception as error:
         if said := refusal(error, said_call, fed):
             raise ValueError(said) from error
-        # an exception of the user's own making stays one, so that it can be caught by its type
+        # the user's own exceptions keep their type, so that they can be caught
         error.add_note(f"raised by {said_call}, traced on one state, with {_in_words(fed)}")
         raise
-    if outside is not None:  # no exception would ever come: see ``indices``
-        raise ValueError(f"{said_call} asks for {outside}.\nJAX would take the nearest one, or none, without a word")
+    if outside is not None:  # JAX never raises here, see ``indices``
+        raise ValueError(f"{said_call} reads {outside}.\nJAX would silently use the nearest entry, or none.")
     return verdict
 
 
 def refusal(error: Exception, said_call: str, fed: Mapping[str, tuple[int, ...]]) -> str | None:
-    """What to say of a function, ``drift(x, u)``, that failed on one state; None for an exception of the user's own."""
+    """The message for a function, ``drift(x, u)``, that failed on one state; None for a user's own exception."""
     if said := cure(error):
         return f"{said_call} {said}.\nIt is traced once on one state, with {_in_words(fed)}"
     if isinstance(error, (TypeError, ValueError, IndexError)):
@@ -240,16 +240,16 @@ def _in_words(fed: Mapping[str, tuple[int, ...]]) -> str:
 
 
 def function_of(function: Callable, name: str, wanted: tuple[int, ...], **fed: tuple[int, ...]) -> None:
-    """Refuse a function that is no part of a problem and cannot be traced, or returns another shape than it should.
+    """Refuse a function outside a problem that cannot be traced, or returns the wrong shape.
 
     Args:
-      function: what a picture or a search is given.
-      name: what it is called, for refusals.
+      function: the function passed to a plot or a search.
+      name: its name in messages.
       wanted: the shape of its result.
       **fed: the shapes of its arguments, by name.
 
     Raises:
-      ValueError: with what was returned, or what cannot be traced.
+      ValueError: with the result, or the reason why it cannot be traced.
     """
     said_call = f"{name}({', '.join(fed)})"
     with own_settings(x64=True):
@@ -265,7 +265,7 @@ def _lengths(problem: Problem, n: int) -> dict[str, tuple[int, ...]]:
 
 
 def calls_back(problem: Problem, n: int) -> bool:
-    """True if a function of a problem calls Python while it runs, where anything may happen."""
+    """True if a function of a problem calls Python while it runs."""
     lengths = _lengths(problem, n)
     with own_settings(x64=True):
         for name in (*OF_ACTION, "target", *STATE_COSTS):
@@ -276,7 +276,7 @@ def calls_back(problem: Problem, n: int) -> bool:
 
 
 def operations_of(problem: Problem, n: int) -> Operations:
-    """What one evaluation of all functions of a problem with ``n`` states takes, as it is written out for XLA."""
+    """The operations of one evaluation of all functions of a problem with ``n`` states, as written out for XLA."""
     lengths, total = _lengths(problem, n), Operations()
     with own_settings(x64=True):
         for name in (*OF_ACTION, "target", *STATE_COSTS):
@@ -290,8 +290,8 @@ def operations_of(problem: Problem, n: int) -> Operations:
 def _trace_once(
     function: Callable, names: tuple[str, ...], lengths: tuple[tuple[int, ...], ...]
 ) -> tuple[tuple[int, ...] | str, str | None, bool, Operations]:
-    """Shape or fault of a function's result, an index outside its array, whether it calls Python, its operations."""
-    verdicts = []  # taken on the way: ``make_jaxpr`` would raise, in its own words, on a result that is text
+    """Shape or fault of a function's result, an index outside its array, True if it calls Python, its operations."""
+    verdicts = []  # recorded while tracing, because ``make_jaxpr`` would raise its own error on a result that is text
 
     def probe(*arguments):
         result = function(*arguments)
@@ -303,15 +303,15 @@ def _trace_once(
 
 
 def _dim(admissible: sets.AdmissibleSet | None) -> int:
-    """The number of inputs; none without a set."""
+    """The number of inputs; zero without a set."""
     return 0 if admissible is None else admissible.dim
 
 
 def _check_arity(problem: Problem, name: str) -> None:
-    """Refuse a function that takes other arguments than the problem passes; a trace would say so less clearly."""
+    """Refuse a function with other arguments than the problem passes, more clearly than a trace would."""
     try:
         signature = inspect.signature(getattr(problem, name))
-    except (TypeError, ValueError):  # a builtin says nothing about its arguments
+    except (TypeError, ValueError):  # a builtin has no signature
         return
     try:
         signature.bind(*_names(problem, name))
@@ -327,17 +327,17 @@ def _check_arity(problem: Problem, name: str) -> None:
 def over_devices(
     mesh: Mesh | None, caller: str, problem: Problem, grid: Grid, *choices: Any, traced: bool
 ) -> Mesh | None:
-    """The mesh over which the nodes are to be divided, if they can be; None for one device.
+    """The mesh over which to divide the nodes, after checks; None for one device.
 
     Args:
-      mesh: as the user gave it.
-      caller: the front door, for messages.
-      problem, grid: the question.
+      mesh: the user's argument.
+      caller: the public function, for messages.
+      problem, grid: the problem and its grid.
       *choices: scheme and methods, each of which must be able to run in parts.
-      traced: whether the call is inside a JAX transformation.
+      traced: True if the call is inside a JAX transformation.
 
     Raises:
-      TypeError, ValueError: with what runs on one device only.
+      TypeError, ValueError: an argument that works on one device only.
     """
     if mesh is None:
         return None

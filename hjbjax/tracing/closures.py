@@ -1,13 +1,13 @@
-"""What a problem's functions see beside their arguments: numbers of the moment, and numbers that JAX is tracing.
+"""The data that a problem's functions read besides their arguments: current numbers, and numbers that JAX traces.
 
-A compiled program belongs to a function, which JAX tells from others by what it is, not by what it computes. A method
-of an object whose attribute was changed, or a function that reads a global, would go on giving the answers of its first
-trace. So a function that reads anything from outside is traced anew whenever a front door is entered, which takes about
-a millisecond, and carries along a mark of what it computes: programs are kept as long as the mark is the same. The
-numbers in a problem's leaves are no part of it.
+A compiled program belongs to a function, which JAX identifies by the object and not by what it computes. A method of an
+object whose attribute was changed, or a function that reads a global, would keep the results of its first trace. So a
+function that reads anything from outside is traced again at every entry of a public function, which takes about a
+millisecond, and gets a mark of what it computes. Programs are reused as long as the mark is the same. The numbers in a
+problem's leaves are not part of the mark.
 
-A function that closes over a number under differentiation, as in ``grad(lambda a: solve(Problem(lambda x, u: a * u)))``
-hides it from those who look at the leaves of a problem. Here such numbers become leaves.
+A function may close over a number that is being differentiated, as in ``grad(lambda a: solve(Problem(lambda x, u: a *
+u)))``, which is not a leaf of the problem. Here such numbers become leaves.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
     Args:
       problem: the problem.
       n: the number of states.
-      dtype: the floating-point type inside a JAX transformation; ``None`` is that of ``float`` there.
+      dtype: the floating-point type inside a JAX transformation. Default: JAX's default float there.
     """
     functions = {name: getattr(problem, name) for name in (*OF_ACTION, *OF_STATE) if callable(getattr(problem, name))}
     if not is_traced(problem):
         known = {name: _settled_outside(each, _shapes(problem, name, n)) for name, each in functions.items()}
         if None not in known.values():
             return altered(problem, **known)
-    # tracers belong to the caller's transformation, so that these functions are traced inside it, in its type
+    # tracers belong to the caller's transformation, so these functions are traced inside it, in its type
     kind = jnp.result_type(float)
     if dtype is not None and kind == np.float64:  # in 32 bits JAX would truncate, and the front door refuses float64
         kind = jnp.dtype(dtype)
@@ -74,16 +74,16 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
 
 
 def digest(problem: Problem, n: int) -> str:
-    """A digest of a settled problem, the same in every process: what its functions compute, and all its numbers."""
+    """A digest of a settled problem, the same in every process, of what its functions compute and of all numbers."""
     account = hashlib.blake2b(digest_size=16)
-    # outside of the caller's ``jit``: only what is known has a digest
+    # outside of the caller's ``jit``, because only known numbers have a digest
     with jax.core.eval_context(), own_settings(x64=True):
         for name in (*OF_ACTION, *OF_STATE):
             function = getattr(problem, name)
             account.update(f"{name} {type(function).__name__} ".encode())
             if callable(function):
                 shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in _shapes(problem, name, n)]
-                with contextlib.suppress(Exception):  # what cannot be traced is refused by the checks, which say why
+                with contextlib.suppress(Exception):  # a function that cannot be traced is refused by the checks
                     closed = jax.make_jaxpr(function)(*shapes)
                     account.update(ADDRESS.sub("", repr(fingerprint(closed.jaxpr, closed.consts)[0])).encode())
         account.update(repr((problem.isaacs, type(problem.controls), type(problem.disturbances))).encode())
@@ -100,7 +100,7 @@ def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:
 
 
 def opened(function: Any, *arguments: jax.ShapeDtypeStruct) -> Any:
-    """A function of some arguments with the tracers that it closed over among its leaves; else as it is."""
+    """A function with the tracers that it closes over among its leaves; unchanged if it has none."""
     if function is None:
         return None
     found, closed = _trace(_bare(function), arguments)
@@ -108,7 +108,7 @@ def opened(function: Any, *arguments: jax.ShapeDtypeStruct) -> Any:
 
 
 def holds_tracers(thing: object, depth: int = 4) -> bool:
-    """True if a function closed over a tracer, itself or by a function that it closed over."""
+    """True if a function closes over a tracer, directly or through a function that it closes over."""
     if isinstance(thing, Partial):
         thing = thing.func
     if depth == 0 or not isinstance(thing, types.FunctionType):
@@ -117,9 +117,9 @@ def holds_tracers(thing: object, depth: int = 4) -> bool:
 
 
 def with_settled_functions(function: Callable) -> Callable:
-    """Decorator of a function of (problem or problems, grid, ...): with the problems settled, and outside of traces.
+    """Decorator of a function of (problem or problems, grid, ...): settles the problems and runs outside of traces.
 
-    A problem of known numbers inside somebody's ``jit`` is solved at once, like any other.
+    A problem of known numbers inside a caller's ``jit`` is solved at once, like any other.
     """
 
     parameters = inspect.signature(function).parameters.values()
@@ -130,7 +130,7 @@ def with_settled_functions(function: Callable) -> Callable:
     def entered(*arguments: Any, **options: Any) -> Any:
         positions = dict(zip(names, arguments, strict=False))
         if len(arguments) > len(names) or positions.keys() & options.keys():
-            return function(*arguments, **options)  # which Python refuses
+            return function(*arguments, **options)  # raises Python's TypeError
         given = positions | options
         if (first, second) == ("problem", "grid") and {first, second} <= given.keys():
             kinds = [type(given[name]).__name__ for name in (first, second)]
@@ -140,7 +140,7 @@ def with_settled_functions(function: Callable) -> Callable:
             given[first] = _settle_all(given[first], given[second].ndim, given.get("dtype"))
         if is_traced(given):
             return function(**given)
-        # inside somebody's ``jit`` a problem of known numbers is still solved on the host, chunk by chunk
+        # inside a caller's ``jit``, a problem of known numbers is still solved on the host, chunk by chunk
         with jax.core.eval_context():
             return function(**given)
 
@@ -148,34 +148,34 @@ def with_settled_functions(function: Callable) -> Callable:
 
 
 def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
-    """A problem, or the problems among several things, settled; the front door refuses everything else."""
+    """A problem, or the problems in an iterable, settled; other things are left for the public function to refuse."""
     if isinstance(asked, Problem):
         return settled(asked, n, dtype)
     if not isinstance(asked, Iterable):
         return asked
-    each = list(asked)  # once: it may be a generator
+    each = list(asked)  # only once, because it may be a generator
     return [settled(one, n, dtype) if isinstance(one, Problem) else one for one in each]
 
 
 class Marked:
     """A function with a mark of what it computes, and with the jaxprs of its traces.
 
-    It equals another of one code and one mark: a lambda written in a loop, or a notebook's cell run again, compiles
-    nothing anew. A mark that is not ``whole`` is shared by functions that differ, and then it equals only its own.
+    It equals another with the same code and the same mark, so a lambda in a loop or a notebook cell that is run again
+    does not recompile. Different functions may share a mark that is not ``whole``; then a function equals only itself.
 
-    Python runs the function once for every kind of arguments: a solve looks at it in half a dozen places (checks,
-    dependence on the control, the chain, slopes of the drift in u), and each would trace it anew.
+    Python runs the function once for every kind of arguments. A solve uses it in about six places (checks, dependence
+    on the control, the chain, slopes of the drift in u), and each would otherwise trace it again.
     """
 
     def __init__(self, function: Callable, mark: object = None):
         self.__wrapped__, self.mark = function, mark  # the name under which ``inspect`` finds the signature
         self.whole = True
-        # a key holds x64 as well, under which constants made inside the function have another type
+        # keys include x64, which changes the type of constants made inside the function
         self._jaxprs: dict[object, tuple[jex.ClosedJaxpr, Any] | None] = {}
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """What the function returns; under a trace by its jaxpr."""
-        if not is_traced(arguments, options):  # on the host a number may be compared, which no jaxpr can
+        """The function's result; under a trace it is computed by the jaxpr."""
+        if not is_traced(arguments, options):  # on the host numbers may be compared, which a jaxpr cannot do
             return self.__wrapped__(*arguments, **options)
         found = self.jaxpr(options, arguments)
         if found is None:
@@ -185,9 +185,9 @@ class Marked:
         return jax.tree.unflatten(structure, jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *leaves))
 
     def jaxpr(self, options: dict, arguments: tuple) -> tuple[jex.ClosedJaxpr, Any] | None:
-        """The jaxpr of the leaves of (options, arguments) and the tree of its results; None where there is none.
+        """The jaxpr of the leaves of (options, arguments) and the tree of its results; None without a jaxpr.
 
-        There is none where the function cannot be traced for all numbers, so that the reason shows where it is called.
+        There is no jaxpr if the function cannot be traced for all numbers; the call then shows the reason.
         """
         leaves, structure = jax.tree.flatten((options, arguments))
         kinds = tuple(map(_kind, leaves))
@@ -206,12 +206,12 @@ class Marked:
             self._jaxprs[key] = None
             return None
         found = jaxprs.in_use(closed), jax.tree.structure(results)
-        if not is_traced(closed.consts):  # else it belongs to one transformation, which ends
+        if not is_traced(closed.consts):  # otherwise it belongs to one transformation, which ends
             self._jaxprs[key] = found
         return found
 
     def _key(self) -> tuple[object, object]:
-        """What tells it from others."""
+        """The values by which it is compared."""
         return (code(self.__wrapped__) if self.whole else self.__wrapped__), self.mark
 
     def __eq__(self, other: object) -> bool:
@@ -221,19 +221,19 @@ class Marked:
         return hash(self._key())
 
     def __reduce__(self) -> tuple[Callable, tuple[Callable]]:
-        """Pickle and copy the function only: jaxprs cannot be pickled, and the next front door makes the mark again."""
+        """Pickle and copy only the function: jaxprs cannot be pickled, and the next public function marks it again."""
         return _function_itself, (self.__wrapped__,)
 
 
 def _function_itself(function: Callable) -> Callable:
-    """The copy of a marked function: the function, without its mark."""
+    """The copy of a marked function: the function without its mark."""
     return function
 
 
 class Opened:
-    """A traced function of what it closed over, of the leaves it held, and of its arguments.
+    """A traced function of the numbers it closes over, its leaves and its arguments.
 
-    It equals another that computes the same of them: the gradient of a loss compiles nothing in its second step.
+    It equals another that computes the same, so that the gradient of a loss does not recompile in its second step.
     """
 
     def __init__(self, jaxpr: jex.Jaxpr):
@@ -242,9 +242,9 @@ class Opened:
         self.mark = mark if whole else self.jaxpr
 
     def __call__(self, known: tuple, *arguments: Any) -> Any:
-        """The function's result, with ``known`` the numbers it closed over and its leaves."""
+        """The function's result, with ``known`` the numbers it closes over and its leaves."""
         constants, leaves = known
-        # a jaxpr wants the dtypes it was traced with, and a solve may have cast the leaves to float32 meanwhile
+        # a jaxpr requires the dtypes of its trace, and a solve may have cast the leaves to float32 meanwhile
         closed = self._in_traced_dtypes(constants, self.jaxpr.constvars)
         return jax.core.eval_jaxpr(
             self.jaxpr, closed, *self._in_traced_dtypes((*leaves, *arguments), self.jaxpr.invars)
@@ -266,16 +266,16 @@ class Opened:
 
 
 def _as_traced(leaf: Numbers) -> Numbers:
-    """A leaf in the type with which it was traced, as an array of JAX's.
+    """A leaf in the type of its trace, as a JAX array.
 
-    After a solve inside of ``jit`` JAX 0.10 takes a float64 array of NumPy's for float32 where a primitive is bound,
-    although x64 is on and ``typeof`` says float64.
+    After a solve inside ``jit``, JAX 0.10 uses a NumPy float64 array as float32 when a primitive is bound, although x64
+    is on and ``typeof`` returns float64.
     """
     return jnp.asarray(leaf, jax.typeof(leaf).dtype) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
 def _kind(leaf: jax.typing.ArrayLike | jax.ShapeDtypeStruct) -> tuple[tuple[int, ...], Any, bool]:
-    """Shape, type and weakness of a number or of its place holder: what a jaxpr depends on."""
+    """Shape, dtype and weak type of a number or of its placeholder, on which a jaxpr depends."""
     aval = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
     return aval.shape, aval.dtype, bool(aval.weak_type)
 
@@ -292,9 +292,9 @@ def _settled_outside(function: Partial, shapes: Sequence[tuple[int, ...]]) -> Pa
     """A function with its mark, and with the numbers that it reads as leaves; None if one of these is traced."""
     function = _bare(function)
     mark = identity(function)
-    if mark is not None:  # library code computes tomorrow what it computes today; a trace takes about a millisecond
+    if mark is not None:  # library code does not change, which saves a trace of about a millisecond
         return Partial(Marked(function.func, mark), *function.args, **function.keywords)
-    # outside of the caller's ``jit`` and always in float64: every front door finds one mark for one function
+    # outside of the caller's ``jit`` and always in float64, so that all public functions find the same mark
     arguments = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
     with jax.core.eval_context(), own_settings(x64=True):
         found, closed = _trace_with_numbers_as_leaves(function, arguments)
@@ -302,7 +302,7 @@ def _settled_outside(function: Partial, shapes: Sequence[tuple[int, ...]]) -> Pa
 
 
 def _settled_inside(function: Partial, shapes: Sequence[tuple[int, ...]], dtype: DType) -> Partial:
-    """A function inside a JAX transformation: with a mark, or with what it closed over as leaves."""
+    """A function inside a JAX transformation: with a mark, or with the numbers it closes over as leaves."""
     function = _bare(function)
     mark = identity(function)
     if mark is not None:
@@ -314,13 +314,13 @@ def _settled_inside(function: Partial, shapes: Sequence[tuple[int, ...]], dtype:
 
 
 def _with_closure_as_leaves(function: Partial, closed: jex.ClosedJaxpr) -> Partial:
-    """A traced function with what it closed over among its leaves."""
+    """A traced function with the numbers it closes over among its leaves."""
     leaves = jax.tree.leaves((function.keywords, function.args))
     return Partial(Opened(closed.jaxpr), (tuple(closed.consts), leaves))
 
 
 def _bare(function: Partial) -> Partial:
-    """The function as the user gave it, if an earlier front door has put a memory around it."""
+    """The user's function, without the ``Marked`` wrapper of an earlier public function."""
     inner = function.func
     return Partial(inner.__wrapped__, *function.args, **function.keywords) if isinstance(inner, Marked) else function
 
@@ -328,8 +328,8 @@ def _bare(function: Partial) -> Partial:
 def _trace_with_numbers_as_leaves(
     function: Partial, arguments: Sequence[jax.ShapeDtypeStruct]
 ) -> tuple[Partial, jex.ClosedJaxpr | None]:
-    """``_trace`` of the function with the numbers that it reads from outside as leaves, as far as it lets them be."""
-    for kinds in (NUMBERS, FLOATS):  # an integer may be a shape or an index, and then there is no trace
+    """``_trace`` of the function with the numbers that it reads from outside as leaves, if they can be leaves."""
+    for kinds in (NUMBERS, FLOATS):  # an integer may be a shape or an index, which cannot be traced
         read = numbers_read(function.func, kinds)
         while read:
             asking = OfNumbers(function.func, tuple(read))
@@ -345,14 +345,14 @@ def _trace_with_numbers_as_leaves(
 
 
 def _trace(function: Partial, arguments: Sequence[jax.ShapeDtypeStruct]) -> tuple[Partial, jex.ClosedJaxpr | None]:
-    """A function and its jaxpr in leaves and arguments; None where it cannot be traced: the checks will say why."""
+    """A function and its jaxpr in leaves and arguments; None if it cannot be traced, which the checks will report."""
     memory = Marked(function.func)
     found = memory.jaxpr(function.keywords, (*function.args, *arguments))
     return Partial(memory, *function.args, **function.keywords), None if found is None else found[0]
 
 
 def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
-    """The function with the mark of its trace; where there is none it equals no other."""
+    """The function with the mark of its trace; without a trace it is equal to no other function."""
     assert isinstance(function.func, Marked)
     found = (object(), True) if closed is None else fingerprint(closed.jaxpr, closed.consts)
     function.func.mark, function.func.whole = found

@@ -1,11 +1,11 @@
-"""A function of one state, evaluated on a whole grid, component by component.
+"""Evaluation of a function of one state on a whole grid, component by component.
 
-``vmap`` of a drift that ends in ``jnp.stack`` writes one array of all nodes per entry to memory. Here the
-function is traced once on a single state, and its jaxpr is evaluated with every vector held as a NumPy object
-array of scalars-per-node: entry i of the state is an array that varies along axis i alone, so that sin θ is
-computed N times and not N^n times, stacking and slicing cost nothing, and XLA fuses what is left.
+``vmap`` of a drift that ends in ``jnp.stack`` writes one array of all nodes per entry to memory. Here the function is
+traced once on a single state, and its jaxpr is evaluated with every vector as a NumPy object array of per-node scalars.
+Entry i of the state is an array that varies only along axis i, so that sin θ is computed N times and not N^n times,
+stacking and slicing cost nothing, and XLA fuses the rest.
 
-What ``interpreter`` has no rule for falls back to ``vmap``, with one warning.
+Primitives without a rule in ``interpreter`` use ``vmap``, with one warning.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def components(function: Callable, *arguments: Any, dtype: DType) -> np.ndarray:
       dtype: floating-point type in which the function is traced.
 
     Returns:
-      An object array of the shape of the function's result; every entry is a per-node scalar.
+      An object array with the shape of the function's result; every entry is a per-node scalar.
     """
     closed, packed = trace(function, *arguments, dtype=dtype)
     (result,) = evaluate(closed, packed, ARRAYS)
@@ -48,12 +48,12 @@ def components(function: Callable, *arguments: Any, dtype: DType) -> np.ndarray:
     (kind,) = (each.dtype for each in closed.out_avals)
     if not jnp.issubdtype(kind, jnp.floating) or kind == dtype:
         return entries
-    # tracers of another type in a closure, inside jit: they are no leaves, which ``cast`` would find
+    # inside jit, a closure may hold tracers of another type, which are not leaves that ``cast`` could find
     return np.vectorize(lambda entry: jnp.asarray(entry, dtype), otypes=[object])(entries)
 
 
 def scalar(function: Callable | Numbers, *arguments: Any, dtype: DType) -> jax.Array:
-    """Values at all nodes of a function that returns a scalar, or of a number in its place: one per-node scalar."""
+    """Values at all nodes of a function that returns a scalar, or of a number used instead: one per-node scalar."""
     if not callable(function):
         return jnp.asarray(function, dtype)
     entries = components(function, *arguments, dtype=dtype)
@@ -65,7 +65,7 @@ def scalar(function: Callable | Numbers, *arguments: Any, dtype: DType) -> jax.A
 def of_state(
     problem: Problem, ingredient: Callable | Numbers | None, x: Sequence[Numbers], t: Numbers, dtype: DType
 ) -> jax.Array:
-    """Values at all nodes of a problem's function of the state alone, a number in its place, or None for zero."""
+    """Values at all nodes of a problem's function of the state, of a number used instead, or of None for zero."""
     entry = 0.0 if ingredient is None else ingredient
     return scalar(entry, *problem.state_arguments(x, t), dtype=dtype)
 
@@ -74,15 +74,15 @@ def trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.Closed
     """The jaxpr of ``function`` on one state, and the arguments as object arrays."""
     packed = [pack(argument) for argument in arguments]
     shapes = [jax.ShapeDtypeStruct(entries.shape, dtype) for entries in packed]
-    # JAX remembers traces by function, also where a global has changed since: hence the marks of ``closures``
+    # JAX caches traces by function, even if a global has changed since; the marks of ``closures`` prevent this
     closed = jax.make_jaxpr(function)(*shapes)
-    if (outside := indices.beyond(closed)) is not None:  # inside jit, where nobody has looked before
-        raise ValueError(f"a function of one state asks for {outside}")
+    if (outside := indices.beyond(closed)) is not None:  # inside jit, where it has not been checked yet
+        raise ValueError(f"a function of one state reads {outside}")
     return closed, packed
 
 
 class _Arrays:
-    """Algebra of arrays over the nodes; ranks are those of the grid, or zero."""
+    """Algebra of arrays over the nodes; each has the rank of the grid, or zero."""
 
     def constant(self, value: Any, index: tuple[int, ...]) -> Numbers:
         return value[index] if np.ndim(value) else value
@@ -90,8 +90,8 @@ class _Arrays:
     def entrywise(
         self, primitive: jex.Primitive, params: dict, operands: list, dtypes: Sequence[np.dtype]
     ) -> jax.Array:
-        # XLA's primitives want equal shapes; broadcasts are fused and never written to memory. The dtype is the
-        # traced one: a Python number that met a float32 state has become float32 there, and must here.
+        # XLA's primitives require equal shapes; broadcasts are fused and never written to memory. The dtype is the
+        # traced one: a Python number combined with a float32 state became float32 in the trace, and must here.
         arrays = [jnp.asarray(value, dtype) for value, dtype in zip(operands, dtypes, strict=True)]
         return primitive.bind(*jnp.broadcast_arrays(*arrays), **params)
 
@@ -102,18 +102,18 @@ class _Arrays:
         return stacks.results(eqn, operands)
 
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list:
-        """The function by components, with its own derivative, which is a function of one state as well."""
+        """The function by components, with its own derivative, which is also a function of one state."""
         if (found := self.whole(eqn, operands)) is not None:  # by ``vmap``, which keeps the rule
             return found
         avals = [array_type(var) for var in eqn.invars]
-        # tangents of integers are of the empty type float0, on which no arithmetic is defined
+        # tangents of integers have the empty type float0, which has no arithmetic
         if not all(jnp.issubdtype(aval.dtype, jnp.floating) for aval in avals):
             return self.nodewise(eqn, operands)
         packed = [lift(value, self) for value in operands]
         shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
 
-        # jax.custom_jvp takes lists of arrays and no object arrays: each operand goes in as the list of its entries
-        def flat(closed, rows):  # rows: the operands, or the operands and their tangents, hence zip without strict
+        # jax.custom_jvp accepts lists of arrays but no object arrays: pass each operand as the list of its entries
+        def flat(closed, rows):  # rows: the operands, or the operands and their tangents, so zip is not strict
             arguments = [object_array(row, shape.shape) for row, shape in zip(rows, shapes * 2, strict=False)]
             return [
                 [jnp.asarray(entry, var.aval.dtype) for entry in lift(value, self).flat]
@@ -127,12 +127,12 @@ class _Arrays:
         @function.defjvp
         @own_settings()
         def derivative(primals, tangents):
-            def one(*args):  # at one state, where binding the equation brings the rule of its author into play
+            def one(*args):  # at one state, where binding the equation applies its derivative rule
                 half = len(args) // 2
                 return jax.jvp(lambda *state: bind(eqn, list(state)), args[:half], args[half:])
 
             both = flat(jax.make_jaxpr(one)(*shapes, *shapes), (*primals, *tangents))
-            # a tangent has the shape of its primal, which may vary along more axes than the tangents it came from
+            # a tangent has the shape of its primal, which may vary along more axes than the incoming tangents
             values, slopes = both[: len(both) // 2], both[len(both) // 2 :]
             return values, jax.tree.map(lambda value, slope: jnp.broadcast_to(slope, value.shape), values, slopes)
 
@@ -146,7 +146,7 @@ class _Arrays:
         """Results of one equation at every node, by ``vmap`` over the flattened nodes."""
         varying = [is_components(value) for value in operands]
         shapes = [np.shape(entry) for value, v in zip(operands, varying, strict=True) if v for entry in value.flat]
-        nodes = np.broadcast_shapes(*shapes)  # of axes along which an operand varies: others stay of length 1
+        nodes = np.broadcast_shapes(*shapes)  # axes along which no operand varies stay of length 1
 
         def gather(value, aval):  # entries that are arrays over the nodes, as one array (nodes, *shape of the operand)
             entries = [jnp.broadcast_to(jnp.asarray(entry, aval.dtype), nodes).reshape(-1) for entry in value.flat]
@@ -155,9 +155,9 @@ class _Arrays:
         arguments = [
             gather(value, var.aval) if v else value for value, v, var in zip(operands, varying, eqn.invars, strict=True)
         ]
-        axes = [0 if v else None for v in varying]  # what holds at all nodes is not copied to each
+        axes = [0 if v else None for v in varying]  # numbers that hold at all nodes are not copied to each
         results = jax.vmap(lambda *one: bind(eqn, list(one)), in_axes=axes)(*arguments)
-        return [  # results (nodes, *shape), taken apart into one array (*grid) an entry
+        return [  # results (nodes, *shape), split into one array (*grid) per entry
             object_array(
                 [result[(slice(None), *index)].reshape(nodes) for index in np.ndindex(*result.shape[1:])],
                 result.shape[1:],

@@ -1,12 +1,12 @@
-"""How the drift and the cost depend on the control: read from the jaxpr, not from a flag or from samples.
+"""Dependence of the drift and the cost on the control, read from the jaxpr rather than from a flag or samples.
 
-The jaxpr of a function is evaluated with polynomials in u instead of numbers. A polynomial is known only by
-the set of its terms: ``()`` is what does not depend on u, ``(0,)`` is u₀, ``(0, 1)`` is u₀u₁. A term of degree above
-two, or one that is no polynomial, is known only by the set of the inputs that enter it: ``frozenset({0})`` is some
-function of u₀. The answer is a proof: a function that is called affine is affine at every state.
+The jaxpr of a function is evaluated with polynomials in u instead of numbers. A polynomial is represented by the set of
+its terms: ``()`` is independent of u, ``(0,)`` is u₀, ``(0, 1)`` is u₀u₁. A term of degree above two, or one that is
+not a polynomial, is represented by the set of its inputs: ``frozenset({0})`` is some function of u₀. The result is a
+proof: a function reported as affine is affine at every state.
 
-The slopes of an affine function are taken by JAX's derivative rules, so that a function with a rule of its own
-(``stop_gradient``, ``custom_jvp``, ``custom_vjp``) of the control counts as any other that is no polynomial.
+The slopes of an affine function come from JAX's derivative rules. So a function with its own derivative rule
+(``stop_gradient``, ``custom_jvp``, ``custom_vjp``) of the control is treated as not polynomial.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ Term = tuple[int, ...] | frozenset[int]  # a product of at most two inputs, or s
 Terms = frozenset
 CONSTANT: Terms = frozenset({()})
 
-# f(a + b) = f(a) + f(b), so that the terms stay those of the operand
+# f(a + b) = f(a) + f(b), so that the terms of the operand stay the same
 _LINEAR = frozenset({"neg", "convert_element_type", "copy", "copy_p", "real"})
 
 
 @dataclass(frozen=True)
 class Dependence:
-    """Terms in the control that each entry of a function's result holds.
+    """The terms in the control that each entry of a function's result contains.
 
     Attributes:
-      entries: one set of terms an entry.
-      operations: what one evaluation of the function takes.
+      entries: one set of terms per entry.
+      operations: the operations of one evaluation of the function.
     """
 
     entries: tuple[Terms, ...]
@@ -56,32 +56,32 @@ class Dependence:
         return not any(term for entry in self.entries for term in entry)
 
     def affine_in(self, inputs: Sequence[int]) -> bool:
-        """True if every entry is affine in these inputs together, whatever the others are."""
+        """True if every entry is affine in these inputs together, for any dependence on the others."""
         wanted = set(inputs)
 
-        # u₀u₀ is (0, 0) and counts twice; no function of unknown kind may hold any of the inputs
+        # u₀u₀ is (0, 0) and counts twice; a function of unknown kind must not contain any of the inputs
         def fits(term: Term) -> bool:
             return sum(j in wanted for j in term) <= (1 if isinstance(term, tuple) else 0)
 
         return all(fits(term) for entry in self.entries for term in entry)
 
     def separable_quadratic_in(self, inputs: Sequence[int]) -> bool:
-        """True if every entry is a sum of quadratic polynomials of one of these inputs each."""
+        """True if every entry is a sum of quadratic polynomials, each of one of these inputs."""
         wanted = set(inputs)
 
-        # as a set (0, 0) is one input, so that squares pass and products of two inputs do not
+        # as a set (0, 0) is one input, so squares pass and products of two inputs do not
         def fits(term: Term) -> bool:
             return len(wanted & set(term)) <= (1 if isinstance(term, tuple) else 0)
 
         return all(fits(term) for entry in self.entries for term in entry)
 
     def quadratic_in(self, inputs: Sequence[int]) -> bool:
-        """True if every entry is a quadratic polynomial of these inputs together, whatever the others are."""
+        """True if every entry is a quadratic polynomial of these inputs together, for any dependence on the others."""
         wanted = set(inputs)
         return all(isinstance(term, tuple) or not wanted & term for entry in self.entries for term in entry)
 
     def products_in(self, inputs: Sequence[int]) -> frozenset[tuple[int, ...]]:
-        """The pairs of different inputs, both among ``inputs`` and the lesser first, whose product is in some entry."""
+        """The pairs of different ``inputs``, the smaller first, whose product is in some entry."""
         wanted = set(inputs)
         pairs = (term for entry in self.entries for term in entry if isinstance(term, tuple) and len(set(term)) == 2)
         return frozenset(pair for pair in pairs if wanted.issuperset(pair))
@@ -96,23 +96,23 @@ class Dependence:
         return tuple(i for i, entry in enumerate(self.entries) if any(wanted & set(term) for term in entry))
 
     def crosses(self, first: Sequence[int], second: Sequence[int]) -> bool:
-        """True if some term holds inputs of both, so that the function is no sum of a part each."""
+        """True if some term contains inputs of both, so that the function is not a sum of one part for each."""
         return any(set(term) & set(first) and set(term) & set(second) for entry in self.entries for term in entry)
 
     def has_square(self, inputs: Sequence[int]) -> bool:
-        """True if some entry holds a second power of one of ``inputs``."""
-        # a term of unknown kind is none: it is a frozenset, and no minimiser of quadratics takes it
+        """True if some entry contains the square of one of ``inputs``."""
+        # a term of unknown kind is a frozenset and does not count, since no minimiser of quadratics accepts it
         return any((j, j) in entry for entry in self.entries for j in inputs)
 
 
 @remembered
 def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: DType) -> Dependence:
-    """Terms of ``function`` in those of its arguments that are controls.
+    """Terms of ``function`` in the arguments that are controls.
 
     Args:
-      function: a function of one state, as a problem holds it: a pytree.
-      *arguments: one pair (length, counts) per argument. The length is ``None`` for a scalar; ``counts`` is true if the
-        entries are inputs. Inputs are numbered through all counted arguments.
+      function: a function of one state, as stored by a problem: a pytree.
+      *arguments: one pair (length, counts) per argument. The length is ``None`` for a scalar; ``counts`` is True if the
+        entries are inputs. Inputs are numbered consecutively over all counted arguments.
       dtype: the floating-point type of the trace. Float64 does not depend on the caller's ``jax.enable_x64``.
     """
     with own_settings(x64=dtype == np.float64 or None):
@@ -122,18 +122,18 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: D
     for (_, counts), shape in zip(arguments, shapes, strict=True):
         entries = np.empty(shape.shape, dtype=object)
         for index in np.ndindex(*shape.shape):
-            entries[index] = frozenset({(number,)}) if counts else CONSTANT  # the input alone, or no input
+            entries[index] = frozenset({(number,)}) if counts else CONSTANT  # the term of this input, or no input
             number += counts
         packed.append(entries)
     (result,) = evaluate(closed, packed, _POLYNOMIALS)
-    if not is_components(result):  # a constant, which the evaluation left as the number that it is
+    if not is_components(result):  # a constant, which the evaluation leaves as a number
         return Dependence((CONSTANT,) * int(np.size(result)))
     return Dependence(tuple(result.reshape(-1)), operations(closed))
 
 
 @dataclass(frozen=True)
 class Influence:
-    """How drift, cost and noise depend on both players' inputs: the control's first, the disturbance's after them.
+    """Dependence of drift, cost and noise on both players' inputs, the control's first, then the disturbance's.
 
     Attributes:
       drift, cost, noise: the dependences.
@@ -148,23 +148,23 @@ class Influence:
 
     @property
     def separable(self) -> bool:
-        """Whether drift and cost are sums of what each player does, and noise is neither's."""
+        """True if drift and cost are sums of one part per player, and the noise depends on neither."""
         crossed = any(function.crosses(self.control, self.disturbance) for function in (self.drift, self.cost))
         return not crossed and self.noise.is_constant
 
     @property
     def operations(self) -> Operations:
-        """What one evaluation of drift, cost and noise takes."""
+        """The operations of one evaluation of drift, cost and noise."""
         return self.drift.operations + self.cost.operations + self.noise.operations
 
     @property
     def meet(self) -> bool:
-        """Whether both players drive some component of the state."""
+        """True if both players drive some common component of the state."""
         return bool(set(self.drift.driven_by(self.control)) & set(self.drift.driven_by(self.disturbance)))
 
 
 def influence(problem: Problem, n: int, dtype: DType) -> Influence:
-    """How the functions of a problem with ``n`` states depend on its players."""
+    """The dependence of the functions of a problem with ``n`` states on its players."""
     m = 0 if problem.controls is None else problem.controls.dim
     k = 0 if problem.disturbances is None else problem.disturbances.dim
     arguments = (*((None, False),) * problem.time_dependent, (n, False), (m, True), *((k, True),) * problem.is_game)
@@ -176,13 +176,13 @@ def influence(problem: Problem, n: int, dtype: DType) -> Influence:
 
 
 def _some_function(operands: Iterable[Terms]) -> Terms:
-    """Term of a function of these operands that is no quadratic polynomial: the set of the inputs that enter it."""
+    """The term of a function of these operands that is not a quadratic polynomial: the set of its inputs."""
     inputs = frozenset(j for terms in operands for term in terms for j in term)
     return frozenset({inputs}) if inputs else CONSTANT
 
 
 def _product(left: Terms, right: Terms) -> Terms:
-    """Terms of a product, each of one factor with each of the other."""
+    """Terms of a product: each term of one factor times each term of the other."""
     return frozenset(_times(p, q) for p in left for q in right)
 
 
@@ -196,7 +196,7 @@ def _times(left: Term, right: Term) -> Term:
 
 
 class _Polynomials:
-    """Algebra of sets of terms: no coefficients, so that terms never cancel and what is called affine is so for all."""
+    """Algebra of sets of terms without coefficients, so terms never cancel and "affine" holds for all numbers."""
 
     def constant(self, value: Numbers, index: tuple[int, ...]) -> Terms:
         return CONSTANT
@@ -207,7 +207,7 @@ class _Polynomials:
         name = primitive.name
         if all(value == CONSTANT for value in operands):
             return CONSTANT
-        # before the linear ones: neither the slope nor the ends of a staircase tell where it is smallest
+        # before the linear ones: the slope and the ends of a staircase do not determine its minimum
         if name == "convert_element_type" and _rounds(params["new_dtype"]):
             return _some_function(operands)
         if name in _LINEAR:
@@ -216,29 +216,29 @@ class _Polynomials:
             return operands[0] | operands[1]
         if name == "mul":
             return _product(*operands)
-        if name == "div" and operands[1] == CONSTANT:  # by something that no input enters; u₀/u₁ is no polynomial
+        if name == "div" and operands[1] == CONSTANT:  # by a number free of inputs; u₀/u₁ is not a polynomial
             return operands[0]
         if name == "square" or (name == "integer_pow" and params["y"] == 2):
             return _product(operands[0], operands[0])
         if name == "integer_pow" and params["y"] == 1:
             return operands[0]
-        # the choice is that of a state, so at each state the result is one of the cases
+        # if the state makes the choice, the result is one of the cases at each state
         if name == "select_n" and operands[0] == CONSTANT:
             return frozenset().union(*operands[1:])
         return _some_function(operands)
 
     def combine(self, operation: Callable, dtype: np.dtype, left: Terms, right: Terms) -> Terms:
-        if operation is jax.lax.add:  # what ``reduce_sum``, ``cumsum`` and products of matrices are made of
+        if operation is jax.lax.add:  # used by ``reduce_sum``, ``cumsum`` and products of matrices
             return left | right
         if operation is jax.lax.mul:
             return _product(left, right)
         return _some_function([left, right])
 
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
-        return None  # sets of terms are an entry's own, and cheap
+        return None  # sets of terms are stored per entry, and are cheap
 
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
-        # not by the terms of ``inner``: the slope that its rule gives need not be the one of what it computes
+        # not by the terms of ``inner``: its derivative rule may differ from the derivative of its computation
         return self.nodewise(eqn, operands)
 
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
@@ -253,7 +253,7 @@ class _Polynomials:
 
 
 def _rounds(dtype: DType) -> bool:
-    """True if numbers become coarse steps in this type: integers, and floating point of 16 bits or fewer."""
+    """True if conversion to this type rounds coarsely: integers, and floating point of 16 bits or fewer."""
     return not np.issubdtype(dtype, np.inexact) or np.finfo(dtype).bits < 32
 
 

@@ -1,8 +1,8 @@
-"""Indices that lie beyond the array they index, found in the jaxpr of a function.
+"""Indices beyond the end of their array, found in the jaxpr of a function.
 
-Where NumPy raises, JAX clamps: x[2] of two states is x[1]. An index that is known when a function is traced stands in
-its jaxpr, behind a few operations on integers ("if negative, add the length"). These alone are carried out here, in
-NumPy; whatever depends on the state is unknown, and unknown indices are let pass.
+Where NumPy raises, JAX clamps: x[2] of two states is x[1]. An index that is known when a function is traced appears in
+its jaxpr, after a few operations on integers ("if negative, add the length"). Only these are evaluated here, in NumPy.
+Everything that depends on the state is unknown, and unknown indices are accepted.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from hjbjax.tracing.jaxprs import array_type
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-# A look costs time before every solve, and slips of the pen are small: x[2] of two states, a row beyond a small table.
-MOST = 10_000  # entries of an array of indices that is looked at
-TURNS = 64  # of a loop of known length that are followed
+# the check takes time before every solve, and typical mistakes are small: x[2] of two states, a row beyond a table
+MOST = 10_000  # largest array of indices to check
+TURNS = 64  # iterations to follow of a loop of known length
 
-# The operations that stand between a written index and the primitive that takes it. JAX itself would do, but compile
-# each on its first use.
+# The operations between a written index and the primitive that uses it. JAX could evaluate them, but would compile each
+# on its first use.
 KNOWN: dict[str, Callable[..., Any]] = {
     "lt": lambda a, b: a < b,
     "le": lambda a, b: a <= b,
@@ -57,11 +57,11 @@ KNOWN: dict[str, Callable[..., Any]] = {
 
 
 def beyond(closed: jex.ClosedJaxpr, names: Sequence[str] = ()) -> str | None:
-    """The first index of a jaxpr that lies outside its array, in words; ``None`` where there is none.
+    """The first index of a jaxpr that is outside its array, in words; ``None`` if there is none.
 
     Args:
       closed: the jaxpr.
-      names: what its inputs are called, as in ("x", "u").
+      names: the names of its inputs, as in ("x", "u").
     """
     labels: list[str | None] = [*names, *(None,) * (len(closed.jaxpr.invars) - len(names))]
     return _walk(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars), labels)[1]
@@ -75,7 +75,7 @@ def calls_back(closed: jex.ClosedJaxpr) -> bool:
 def _walk(
     jaxpr: jex.Jaxpr, consts: Sequence[Any], inputs: Sequence[Any], labels: Sequence[str | None]
 ) -> tuple[list[np.ndarray | None], str | None]:
-    """Known outputs (``None`` for the others), and the first index outside its array, in words."""
+    """Known outputs (``None`` for unknown ones), and the first index outside its array, in words."""
     values: dict[Any, np.ndarray | None] = dict(zip(jaxpr.invars, inputs, strict=True))
     values |= {var: _index_array(const) for var, const in zip(jaxpr.constvars, consts, strict=False)}
     called: dict[Any, str | None] = dict(zip(jaxpr.invars, labels, strict=True))
@@ -86,19 +86,19 @@ def _walk(
     for eqn in jaxpr.eqns:
         known = [look(var) for var in eqn.invars]
         first = eqn.invars[0] if eqn.invars else None
-        # an array is called by its name as long as it is the argument itself, also inside an inner ``jit``
+        # an array keeps the argument's name as long as it is the argument itself, also inside an inner ``jit``
         name = None if first is None or jaxprs.is_literal(first) else called.get(first)
         if (found := _outside(eqn, known, name)) is not None:
             return [], found
         results: Sequence[Any] = [None] * len(eqn.outvars)
         passed = [None if jaxprs.is_literal(var) else called.get(var) for var in eqn.invars]
         inner = _inner(eqn)
-        if eqn.primitive.name == "scan":  # its counters are known turn by turn, and unknown in the body as such
+        if eqn.primitive.name == "scan":  # its counters are known in each iteration, but not in the body in general
             inner, (results, found) = [], _walk_turns(eqn, known, passed)
             if found is not None:
                 return [], found
         for body in inner:
-            fits = len(body.jaxpr.invars) == len(known)  # else a loop or a branch, whose inputs are others
+            fits = len(body.jaxpr.invars) == len(known)  # otherwise it is a loop or a branch with other inputs
             arguments = (known, passed) if fits else ([None] * len(body.jaxpr.invars),) * 2
             outputs, found = _walk(body.jaxpr, body.consts, *arguments)
             if found is not None:
@@ -114,7 +114,7 @@ def _walk(
 def _walk_turns(
     eqn: jex.JaxprEqn, known: list[np.ndarray | None], labels: Sequence[str | None]
 ) -> tuple[list[np.ndarray | None], str | None]:
-    """Known results of a loop, turn by turn as far as its counters are known, and the first index outside its array."""
+    """Known results of a loop, followed as long as its counters are known, and the first index outside its array."""
     body, length = eqn.params["jaxpr"], eqn.params["length"]
     # operands of ``scan``: constants, carry, and arrays taken row by row
     start, carried = (
@@ -130,22 +130,22 @@ def _walk_turns(
             return [], found
         carry = outputs[: len(carry)]
         if all(each is None for each in (*carry, *rows)):
-            break  # nothing known is left, so that every other turn would look like this one
+            break  # nothing is known any more, so all further iterations are alike
     followed = length <= TURNS and any(each is not None for each in carry)
     return [*(carry if followed else (None,) * len(carry)), *(None for _ in eqn.outvars[len(carry) :])], None
 
 
 def _count_whole(outside: Sequence[jex.Var | jex.Literal], inside: Sequence[jex.Var | jex.Literal]) -> int:
-    """The number of values that a turn of a loop takes, or returns, whole and not as rows of arrays.
+    """The number of values that an iteration of a loop takes, or returns, whole and not as rows of arrays.
 
-    By their ranks: JAX 0.12 keeps the numbers of operands under other parameters than JAX 0.10.
+    Found by rank, because JAX 0.12 stores the numbers of operands under other parameters than JAX 0.10.
     """
     pairs = zip(outside, inside, strict=True)
     return sum(len(array_type(whole).shape) == len(array_type(part).shape) for whole, part in pairs)
 
 
 def _inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:
-    """The jaxprs that an equation calls; not the ones that combine two entries of a scatter."""
+    """The jaxprs that an equation calls, without those that combine two entries of a scatter."""
     found = []
     for name, value in eqn.params.items():
         for each in value if isinstance(value, (tuple, list)) else (value,):
@@ -163,17 +163,17 @@ def _index_array(value: Numbers) -> np.ndarray | None:
         return None
     try:
         return np.asarray(value)
-    except Exception:  # a tracer: of no known value
+    except Exception:  # a tracer, whose value is unknown
         return None
 
 
 def _evaluate(eqn: jex.JaxprEqn, known: list[np.ndarray | None]) -> list[np.ndarray | None]:
-    """Results of an operation on known integers; ``None`` where it is another, or they are not known."""
+    """Results of an operation on known integers; ``None`` for other operations or unknown integers."""
     rule, shape = KNOWN.get(eqn.primitive.name), array_type(eqn.outvars[0]).shape if eqn.outvars else ()
-    # the size in floating point: a shape such as (10**10, 10**10) would overflow int64 to a small number
+    # the size as a float: a shape such as (10**10, 10**10) would overflow int64 to a small number
     if rule is None or any(value is None for value in known) or np.prod(shape, dtype=float) > MOST:
         return [None] * len(eqn.outvars)
-    with np.errstate(all="ignore"):  # integers that overflow wrap in JAX without a word
+    with np.errstate(all="ignore"):  # overflowing integers wrap silently in JAX
         return [_index_array(rule(*known, **eqn.params))]
 
 
@@ -181,14 +181,14 @@ def _evaluate(eqn: jex.JaxprEqn, known: list[np.ndarray | None]) -> list[np.ndar
 
 
 def _outside(eqn: jex.JaxprEqn, known: list[np.ndarray | None], name: str | None) -> str | None:
-    """Entries that an equation asks for outside its array, in words; ``None`` where there are none."""
+    """Entries outside its array that an equation reads or writes, in words; ``None`` if there are none."""
     kind, shape = eqn.primitive.name, getattr(eqn.invars[0].aval, "shape", ()) if eqn.invars else ()
     if kind == "dynamic_slice":
         columns = dict(enumerate(known[1 : 1 + len(shape)]))
         sizes = eqn.params["slice_sizes"]
     elif kind == "dynamic_update_slice":
         columns, sizes = dict(enumerate(known[2 : 2 + len(shape)])), array_type(eqn.invars[1]).shape
-    # ``x.at[i].get(mode="fill", fill_value=0)`` asks for entries outside on purpose
+    # ``x.at[i].get(mode="fill", fill_value=0)`` reads entries outside on purpose
     elif kind == "gather" and not _has_stand_in(eqn.params.get("fill_value")):
         columns, sizes = _columns(known[1], eqn.params["dimension_numbers"].start_index_map), eqn.params["slice_sizes"]
     elif kind.startswith("scatter"):
@@ -198,7 +198,7 @@ def _outside(eqn: jex.JaxprEqn, known: list[np.ndarray | None], name: str | None
     else:
         return None
     for axis, starts in columns.items():
-        last = shape[axis] - sizes[axis]  # the largest start at which the whole window lies inside
+        last = shape[axis] - sizes[axis]  # the largest start for which the whole window is inside
         if starts is None or np.size(starts) == 0 or not (np.min(starts) < 0 or np.max(starts) > last):
             continue
         start = next(int(k) for k in np.ravel(starts) if not 0 <= k <= last)
@@ -207,7 +207,7 @@ def _outside(eqn: jex.JaxprEqn, known: list[np.ndarray | None], name: str | None
 
 
 def _has_stand_in(fill: float | None) -> bool:
-    """True if a gather was given a number for entries outside; NaN is what JAX takes unasked."""
+    """True if a gather has a fill value for entries outside; NaN is JAX's default."""
     return fill is not None and not np.isnan(fill)
 
 
@@ -217,16 +217,16 @@ def _columns(indices: np.ndarray | None, axes: Sequence[int]) -> dict[int, np.nd
 
 
 def _window(numbers: jax.lax.ScatterDimensionNumbers, shape: tuple[int, ...], updates: tuple[int, ...]) -> list[int]:
-    """Length along each axis of what one update of a scatter covers."""
+    """Length along each axis of the window of one update of a scatter."""
     single = {*numbers.inserted_window_dims, *getattr(numbers, "operand_batching_dims", ())}
     widths = iter(updates[axis] for axis in numbers.update_window_dims)
     return [1 if axis in single else next(widths) for axis in range(len(shape))]
 
 
 def _sentence(name: str | None, shape: tuple[int, ...], axis: int, start: int, size: int) -> str:
-    """The entry that is asked for and those that there are, for a refusal."""
+    """The index and the valid range, for a message."""
     count = shape[axis]
-    # x[-3] of two states stands in the jaxpr as -1, after JAX has added the length
+    # x[-3] of two states appears in the jaxpr as -1, after JAX has added the length
     entry = f"entry {start}" if start >= 0 else f"entry {start - count} (from the end)"
     if size > 1:
         entry = f"entries {start} to {start + size - 1}"

@@ -1,7 +1,7 @@
-"""A jaxpr of a function of one state, evaluated on object arrays whose entries an algebra knows to handle.
+"""Evaluation of the jaxpr of a function of one state on object arrays, whose entries belong to an algebra.
 
-Three kinds of primitives have a rule: those that move entries about (one rule: move labels instead), those that act
-entry by entry, and sums and products. Anything else is left to the algebra's ``nodewise``, with one warning.
+Three kinds of primitives have a rule: primitives that move entries (one rule for all: move labels instead), primitives
+that act entry by entry, and sums and products. All others use the algebra's ``nodewise``, with one warning.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Operand: TypeAlias = Numbers  # of an equation: an object array of scalars, or n
 
 
 class FallbackWarning(UserWarning):
-    """A primitive has no component rule and is evaluated node by node with ``vmap``: correct, slower."""
+    """A primitive without a component rule is evaluated node by node with ``vmap``, which is correct but slower."""
 
 
 class Algebra(Protocol):
@@ -56,17 +56,17 @@ class Algebra(Protocol):
         """A sum, a product, a maximum ... of two scalars."""
 
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
-        """Results of a function that brings a derivative rule of its own."""
+        """Results of a function with a custom derivative rule."""
 
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> list | None:
-        """Results of an equation on vectors too long for components; None where it goes by the rules for these."""
+        """Results of an equation on vectors too long for components; None if the component rules apply."""
 
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
-        """Results of an equation for which there is no rule."""
+        """Results of an equation without a rule."""
 
 
 def pack(argument: Sequence[Numbers] | Numbers) -> np.ndarray:
-    """A list of per-node scalars, or one of them, as an object array."""
+    """A list of per-node scalars, or a single one, as an object array."""
     if isinstance(argument, (list, tuple)):
         return object_array(argument, (len(argument),))
     return object_array([argument], ())
@@ -87,11 +87,11 @@ def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebra: Alg
 
     Args:
       closed: the jaxpr of a function of one state.
-      arguments: one value an input; an object array, or an array that is the same at all nodes.
-      algebra: what the scalars are; arrays over the nodes, or abstract ones that record how results depend on inputs.
+      arguments: one value per input, an object array or an array that is the same at all nodes.
+      algebra: the scalars: arrays over the nodes, or abstract ones that record how results depend on inputs.
 
     Returns:
-      One value an output, likewise.
+      One value per output, of the same kinds.
     """
     env: dict[jex.Var, Any] = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
     env |= dict(zip(closed.jaxpr.invars, arguments, strict=True))
@@ -103,7 +103,7 @@ def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebra: Alg
 
 
 def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
-    """Results of one equation by the first rule that has an answer."""
+    """Results of one equation by the first rule that applies."""
     name = eqn.primitive.name
     if not any(map(varies, operands)):
         return _bind_uniform(eqn, operands)
@@ -121,7 +121,7 @@ def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
         if name not in RULES:
             _warn_once(name)
         return found
-    # A rule that gives None has met an index that is not known here, which only a node-by-node evaluation can follow.
+    # a rule returns None if an index is unknown, which only a node-by-node evaluation can follow
     if name in MOVES:
         moved = _move(eqn, operands, algebra)
         if moved is not None:
@@ -138,34 +138,34 @@ def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
         return [_reduce(eqn, lift(operands[0], algebra), algebra)]
     elif name == "dot_general":
         return [_contract(eqn, lift(operands[0], algebra), lift(operands[1], algebra), algebra)]
-    # Scalars in, scalars out: ``vmap`` over the nodes is then all that a rule would do, nothing to warn of.
+    # for scalars a rule would also use ``vmap`` over the nodes, so there is no need to warn
     if any(np.shape(value) != () for value in operands) or any(array_type(var).shape != () for var in eqn.outvars):
         _warn_once(name)
     return algebra.nodewise(eqn, operands)
 
 
 def _bind_uniform(eqn: jex.JaxprEqn, operands: list) -> list:
-    """Results of an equation none of whose operands varies over the nodes; concrete while these are."""
+    """Results of an equation whose operands are the same at all nodes; concrete if the operands are concrete."""
     if any(isinstance(value, jax.core.Tracer) for value in operands):
         return bind(eqn, operands)
     if (result := in_numpy(eqn, operands)) is not None:
         return [result]
-    # inside ``jit`` an index that is computed from constants would become a tracer, and every move by it a fallback
+    # inside ``jit``, an index computed from constants would otherwise become a tracer and need the fallback
     with jax.ensure_compile_time_eval():
         return bind(eqn, operands)
 
 
 def _are_known(values: Iterable[Operand]) -> bool:
-    """True if all are concrete numbers that hold at all nodes."""
+    """True if all values are concrete numbers that hold at all nodes."""
     return not any(varies(value) or isinstance(value, jax.core.Tracer) for value in values)
 
 
 def _move(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list[np.ndarray] | None:
-    """Results of a data-moving primitive: JAX moves integer labels, the entries follow; None for unknown indices."""
+    """Results of a data-moving primitive, found by moving integer labels with JAX; None for unknown indices."""
     data = set(MOVES[eqn.primitive.name](len(operands)))
     if not _are_known([value for position, value in enumerate(operands) if position not in data]):
         return None
-    pool: list[Any] = []  # label k stands for the entry pool[k], from whichever operand it came
+    pool: list[Any] = []  # label k represents the entry pool[k], from any of the operands
     labelled = list(operands)
     for position in sorted(data):
         entries = lift(operands[position], algebra)
@@ -173,27 +173,27 @@ def _move(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list[np.ndarra
         pool.extend(entries.reshape(-1))
     fill = eqn.params.get("fill_value")
     pool.append(algebra.constant(np.asarray(np.nan if fill is None else fill), ()))
-    if fill is not None:  # where none is given, JAX fills integers with the least one, a negative label too
+    if fill is not None:  # without a fill value, JAX fills integers with the least one, which is also a negative label
         eqn = eqn.replace(params=eqn.params | {"fill_value": -1})
     if eqn.primitive.name in IN_NUMPY:
         moved = [IN_NUMPY[eqn.primitive.name](*labelled, **eqn.params)]
     else:
         with jax.ensure_compile_time_eval():
             moved = bind(eqn, labelled)
-    return [  # a gather out of range has a negative label: it takes the fill value at the end
+    return [  # an index out of range gives a negative label, which takes the fill value at the end
         object_array([pool[max(label, -1)] for label in np.ravel(labels)], np.shape(labels)) for labels in moved
     ]
 
 
 def _scatter(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> np.ndarray | None:
-    """``x.at[known].add(...)`` and its like: each update goes where a one in its place would go; None for unknown."""
+    """``x.at[known].add(...)`` and similar: JAX shows where each update goes; None for unknown indices."""
     target, indices, updates = operands
     if not _are_known([indices]):
         return None
     entries, updates = lift(target, algebra).copy(), lift(updates, algebra)
     numbers, mode = eqn.params["dimension_numbers"], eqn.params["mode"]
     combine = functools.partial(algebra.combine, SCATTERS[eqn.primitive.name], array_type(eqn.invars[0]).dtype)
-    for position in np.ndindex(*updates.shape):  # one by one, as labels would add up where two updates meet
+    for position in np.ndindex(*updates.shape):  # one by one, because labels of updates to the same entry would add up
         one = np.zeros(updates.shape, np.int32)
         one[position] = 1
         with jax.ensure_compile_time_eval():
@@ -204,12 +204,12 @@ def _scatter(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> np.ndarray 
 
 
 def _branch(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
-    """``cond`` and ``switch``: the branch that is known to be taken, or a choice node by node, as under ``vmap``."""
+    """``cond`` and ``switch``: the known branch, or a choice node by node, as under ``vmap``."""
     index, *rest = operands
     branches = eqn.params["branches"]
     if _are_known([index]):
         return evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], rest, algebra)  # JAX clamps it, too
-    # all branches are evaluated, and ``select_n`` takes one entry: a NaN in another stays out of the value
+    # all branches are evaluated and ``select_n`` picks one entry, so a NaN in another branch has no effect
     index = lift(index, algebra).item()
     outputs = [[lift(value, algebra) for value in evaluate(branch, rest, algebra)] for branch in branches]
     results = []
@@ -222,7 +222,7 @@ def _branch(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
 
 
 def _entrywise(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> np.ndarray:
-    """Results entry by entry; a scalar beside an array stands for all of its entries."""
+    """Results entry by entry; a scalar combined with an array is used for all entries."""
     lifted = np.broadcast_arrays(*(lift(value, algebra) for value in operands))
     dtypes = [array_type(var).dtype for var in eqn.invars]
     rows = zip(*(value.reshape(-1) for value in lifted), strict=True)
@@ -235,11 +235,11 @@ def _reduce(eqn: jex.JaxprEqn, entries: np.ndarray, algebra: Algebra) -> np.ndar
     axes = tuple(eqn.params["axes"])
     kept = [axis for axis in range(entries.ndim) if axis not in axes]
     shape = tuple(entries.shape[axis] for axis in kept)
-    if entries.size == 0:  # the neutral element, which JAX knows for every operation and dtype
+    if entries.size == 0:  # the neutral element, which JAX provides for every operation and dtype
         return lift(_bind_uniform(eqn, [np.zeros(entries.shape, array_type(eqn.invars[0]).dtype)])[0], algebra)
     rows = entries.transpose(*kept, *axes).reshape(math.prod(shape), -1)
     combine = functools.partial(algebra.combine, REDUCTIONS[eqn.primitive.name], array_type(eqn.invars[0]).dtype)
-    # from the left, in one order for all nodes; XLA's own reductions may take another and round otherwise
+    # from the left, in the same order for all nodes; XLA's own reductions may use another order and round differently
     return object_array([functools.reduce(combine, row) for row in rows], shape)
 
 
@@ -247,7 +247,7 @@ def _accumulate(eqn: jex.JaxprEqn, entries: np.ndarray, algebra: Algebra) -> np.
     """Running sums, products, maxima ... along one axis."""
     axis, step = eqn.params["axis"], -1 if eqn.params["reverse"] else 1
     combine = functools.partial(algebra.combine, CUMULATIVE[eqn.primitive.name], array_type(eqn.invars[0]).dtype)
-    rows = np.moveaxis(entries, axis, -1)[..., ::step]  # turned about for a reverse sum, and back at the end
+    rows = np.moveaxis(entries, axis, -1)[..., ::step]  # reversed for a reverse sum, and reversed back at the end
     result = np.empty(rows.shape, dtype=object)
     for index in np.ndindex(*rows.shape[:-1]):
         result[index] = object_array(list(itertools.accumulate(rows[index], combine)), rows.shape[-1:])
@@ -263,7 +263,7 @@ def _contract(eqn: jex.JaxprEqn, left: np.ndarray, right: np.ndarray, algebra: A
     rows = tuple(left.shape[axis] for axis in free_l)
     columns = tuple(right.shape[axis] for axis in free_r)
     length = math.prod(left.shape[axis] for axis in contract_l)
-    # both as (batch, rows or columns, length), so that each entry of the result is one dot product of two last axes
+    # both as (batch, rows or columns, length), so that each entry of the result is a dot product of two last axes
     left = left.transpose(*batch_l, *free_l, *contract_l).reshape(math.prod(batch), math.prod(rows), length)
     right = right.transpose(*batch_r, *free_r, *contract_r).reshape(math.prod(batch), math.prod(columns), length)
     dtype = array_type(eqn.outvars[0]).dtype
@@ -277,12 +277,12 @@ def _contract(eqn: jex.JaxprEqn, left: np.ndarray, right: np.ndarray, algebra: A
     return object_array(inner, batch + rows + columns)
 
 
-@functools.cache  # a solve evaluates its functions many times, and every one of them would warn
+@functools.cache  # a solve evaluates its functions many times, and would warn every time
 def _warn_once(name: str) -> None:
-    """Warn of a primitive without a rule, once in a process."""
+    """Warn about a primitive without a rule, once per process."""
     streams.warn(
         f"the primitive {name!r} has no component rule: the function that uses it is evaluated node by node, "
-        "which is correct and slower; entry-by-entry arithmetic on x[0], x[1], ... avoids it",
+        "which is correct but slower. Entry-by-entry arithmetic on x[0], x[1], ... avoids it.",
         FallbackWarning,
         stacklevel=2,
     )

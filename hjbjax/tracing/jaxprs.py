@@ -1,7 +1,7 @@
-"""The parts of a jaxpr, and JAX's primitives by the rule that evaluates them by components; see ``components``.
+"""The parts of a jaxpr, and JAX's primitives grouped by the rule that evaluates them by components.
 
-The types are those of ``jax.extend.core``, imported when the first function is traced and not with the package:
-``jax.extend`` brings Pallas along, 15 ms of every ``import hjbjax``.
+See ``components``. The types belong to ``jax.extend.core``, which is imported when the first function is traced and not
+with the package: ``jax.extend`` imports Pallas, which would add 15 ms to every ``import hjbjax``.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from hjbjax.problem.types import Numbers
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-# Which of its n operands a data-moving primitive moves; the others are indices, and an index that varies from node to
-# node moves other entries at every node, for which only ``vmap`` has an answer.
+# The positions, among n operands, of those that a data-moving primitive moves. The other operands are indices. If an
+# index varies from node to node, the primitive moves different entries at every node, which requires ``vmap``.
 MOVES: dict[str, Callable[[int], Sequence[int]]] = {
     "broadcast_in_dim": lambda n: (0,),
     "reshape": lambda n: (0,),
@@ -48,7 +48,7 @@ def _broadcast(
     return np.broadcast_to(x.reshape([lengths.get(axis, 1) for axis in range(len(shape))]), shape)
 
 
-# The commonest of them in NumPy, for labels and for constants: JAX would compile each on its first use.
+# The most common ones in NumPy, for labels and for constants, because JAX would compile each on its first use.
 IN_NUMPY: dict[str, Callable[..., np.ndarray]] = {
     "broadcast_in_dim": _broadcast,
     "slice": lambda x, start_indices, limit_indices, strides: x[
@@ -69,7 +69,7 @@ _ARITHMETIC: dict[str, Callable[..., np.ndarray]] = {
     "convert_element_type": np.asarray,
 }
 
-# ``scatter`` alone moves entries, these compute: several updates may meet in one entry
+# ``scatter`` only moves entries, these compute: several updates may add up in one entry
 SCATTERS = {"scatter-add": jax.lax.add, "scatter-sub": jax.lax.sub, "scatter-mul": jax.lax.mul}
 SCATTERS |= {"scatter-min": jax.lax.min, "scatter-max": jax.lax.max}
 
@@ -92,14 +92,14 @@ REDUCTIONS: dict[str, Callable] = {
 
 CUMULATIVE = {"cumsum": jax.lax.add, "cumprod": jax.lax.mul, "cummax": jax.lax.max, "cummin": jax.lax.min}
 
-# Under which parameter a call keeps what it calls; a primitive has several names, as JAX has renamed it over the years.
-# A custom_vjp is none of them: to look inside would lose its rule, and ``vmap`` keeps it.
+# The parameter under which a call stores its jaxpr, for all names of the primitive in different versions of JAX. A
+# custom_vjp is not included: evaluating its jaxpr would lose its rule, and ``vmap`` keeps the rule.
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
 CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr"}
 
 
 def in_numpy(eqn: jex.JaxprEqn, operands: Sequence[Numbers]) -> np.ndarray | None:
-    """Result of an equation on concrete numbers where NumPy gives the same bits, else None."""
+    """Result of an equation on concrete numbers if NumPy gives the same bits, else None."""
     name, dtypes = eqn.primitive.name, [array_type(var).dtype for var in (*eqn.invars, *eqn.outvars)]
     if name not in IN_NUMPY and (name not in _ARITHMETIC or not all(np.issubdtype(d, np.floating) for d in dtypes)):
         return None
@@ -117,40 +117,40 @@ def bind(eqn: jex.JaxprEqn, operands: Sequence[Numbers]) -> list:
 
 
 def array_type(var: jex.Var | jex.Literal) -> jax.core.ShapedArray:
-    """Shape and dtype of a variable of a jaxpr; JAX annotates a wider type, for tokens and references."""
+    """Shape and dtype of a variable of a jaxpr; JAX annotates a wider type that includes tokens and references."""
     return cast(jax.core.ShapedArray, var.aval)
 
 
 def is_literal(operand: jex.Var | jex.Literal) -> TypeGuard[jex.Literal]:
-    """True for a number in the code, which no variable of the jaxpr stands for."""
+    """True for a number in the code, which is not a variable of the jaxpr."""
     from jax.extend.core import Literal
 
     return isinstance(operand, Literal)
 
 
 def is_closed(value: Any) -> TypeGuard[jex.ClosedJaxpr]:
-    """True for a jaxpr that brings its constants along."""
+    """True for a jaxpr that includes its constants."""
     from jax.extend.core import ClosedJaxpr
 
     return isinstance(value, ClosedJaxpr)
 
 
 def is_open(value: Any) -> TypeGuard[jex.Jaxpr]:
-    """True for a jaxpr whose constants are somewhere else, or that has none."""
+    """True for a jaxpr without constants, or with constants stored elsewhere."""
     from jax.extend.core import Jaxpr
 
     return isinstance(value, Jaxpr)
 
 
 def closed(jaxpr: jex.Jaxpr) -> jex.ClosedJaxpr:
-    """A jaxpr without constants as one that brings them along."""
+    """A jaxpr without constants as a closed jaxpr."""
     from jax.extend.core import ClosedJaxpr
 
     return ClosedJaxpr(jaxpr, ())
 
 
 def in_use(found: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
-    """A jaxpr with its constants in the types that numbers have: without x64 a trace keeps NumPy's float64."""
+    """A jaxpr with its constants in JAX's default types; without x64 a trace keeps NumPy's float64."""
     from jax.extend.core import ClosedJaxpr
 
     return ClosedJaxpr(found.jaxpr, [_in_use(constant) for constant in found.consts])

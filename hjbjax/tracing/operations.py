@@ -1,8 +1,8 @@
-"""How long the program of a function of one state is, counted on its jaxpr before anything is compiled.
+"""The length of a function's program, counted on its jaxpr before anything is compiled.
 
-By components a sum of two vectors of three entries is three operations, each on an array over the nodes; what
-``stacks`` does to a long vector is one, and a kernel of its own. XLA takes about a millisecond over the first kind,
-wherever they are fused, and a search over the actions writes each of them out some eighty times.
+By components, a sum of two vectors with three entries is three operations, each on an array over the nodes. A long
+vector in ``stacks`` is one operation and its own kernel. XLA takes about a millisecond per operation of the first kind,
+even when they are fused, and a search over the actions writes each of them out about eighty times.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from hjbjax.tracing.jaxprs import CALLS, CUMULATIVE, ENTRYWISE, MOVES, REDUCTION
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-UNIFORM, COMPONENTS, STACK = range(3)  # kinds of a value: numbers that hold at all nodes, one array an entry, one array
+UNIFORM, COMPONENTS, STACK = range(3)  # kinds of values: numbers that hold at all nodes, one array per entry, one array
 
 
 @dataclasses.dataclass(frozen=True)
 class Operations:
-    """What one evaluation of a function takes, over all nodes at once.
+    """The operations in one evaluation of a function, over all nodes at once.
 
     Attributes:
       single: operations on one component each.
@@ -41,13 +41,13 @@ NONE = Operations()
 
 
 def operations(closed: jex.ClosedJaxpr) -> Operations:
-    """The operations of a function of one state, all of whose arguments vary from node to node.
+    """The operations of a function of one state whose arguments all vary from node to node.
 
     Args:
       closed: its jaxpr.
 
     Returns:
-      Their numbers, as ``components`` writes them out; a loop inside the function is one.
+      Their numbers, as ``components`` writes them out; a loop inside the function counts as one.
     """
     return _walk(closed.jaxpr, [COMPONENTS] * len(closed.jaxpr.invars))[0]
 
@@ -56,7 +56,7 @@ def _walk(jaxpr: jex.Jaxpr, inputs: Sequence[int]) -> tuple[Operations, list[int
     """The operations of a jaxpr and the kinds of its outputs."""
     kinds: dict[jex.Var | jex.Literal, int] = dict(
         zip(jaxpr.invars, inputs, strict=True)
-    )  # what is not in it is a constant
+    )  # other variables are constants
 
     def kind(var: jex.Var | jex.Literal) -> int:
         return UNIFORM if jaxprs.is_literal(var) else kinds.get(var, UNIFORM)  # a literal has no hash
@@ -70,10 +70,10 @@ def _walk(jaxpr: jex.Jaxpr, inputs: Sequence[int]) -> tuple[Operations, list[int
 
 
 def _one(eqn: jex.JaxprEqn, operands: Sequence[int]) -> tuple[Operations, list[int]]:
-    """The operations of an equation and the kinds of its results; the rules are those of ``interpreter``."""
+    """The operations of an equation and the kinds of its results, by the rules of ``interpreter``."""
     name, by_entries = eqn.primitive.name, [COMPONENTS] * len(eqn.outvars)
     if not any(operands):
-        return Operations(), [UNIFORM] * len(eqn.outvars)  # computed once, and not at every node
+        return Operations(), [UNIFORM] * len(eqn.outvars)  # computed once, not at every node
     is_whole = stacks.is_whole(eqn, STACK in operands)
     if name in CALLS and CALLS[name] in eqn.params and not (name == "custom_jvp_call" and is_whole):
         inner = eqn.params[CALLS[name]]
@@ -89,7 +89,7 @@ def _one(eqn: jex.JaxprEqn, operands: Sequence[int]) -> tuple[Operations, list[i
 def _by_entries(eqn: jex.JaxprEqn) -> int:
     """The operations of an equation by components."""
     name = eqn.primitive.name
-    if name in MOVES:  # which move entries about that are there already
+    if name in MOVES:  # moves entries without computing
         return 0
     if name in REDUCTIONS or name in CUMULATIVE:
         return array_type(eqn.invars[0]).size

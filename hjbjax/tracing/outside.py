@@ -1,12 +1,12 @@
-"""What a function reads from outside: whether it computes as another does, and numbers that it can take as arguments.
+"""The data that a function reads from outside: to recognise equal functions, and to turn numbers into arguments.
 
-A lambda in a loop, or a notebook's cell run again, makes a new function of the code of before. Its code and what the
-code reads say whether it computes alike; whoever asks for ``is`` compiles again, seconds for nothing.
+A lambda in a loop, or a notebook cell that is run again, makes a new function with the same code. Its code, and what
+the code reads, decide whether it computes the same; comparing functions by identity would recompile for seconds.
 
 ``for mass in masses: solve(Problem(lambda x, u: u / mass, ...), grid)`` would still compile a program for every mass,
-since a number that a function closes over is part of what it computes. So the cells and the globals that hold a number
-are found, and the function is written again with these as an argument: they are leaves of the problem like any other.
-A number stays where it is if the function does more with it than arithmetic: an exponent decides how a cost depends on
+since a number that a function closes over is part of its computation. So the cells and globals that hold a number are
+found, and the function is rewritten with these numbers as an argument. They are then leaves of the problem like any
+other. A number stays in the function if it is used for more than arithmetic: an exponent decides how a cost depends on
 the control, an integer may be a shape, a comparison may choose between two branches.
 """
 
@@ -34,26 +34,26 @@ from hjbjax.tracing import jaxprs
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of rules of derivatives, made anew with every trace
+ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of derivative rules, which every trace makes again
 CALLBACKS = ("pure_callback", "io_callback")
-# whose functions compute tomorrow what they compute today: problems made of these alone need no trace at all
+# libraries whose functions do not change: a problem that only uses these needs no trace
 LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
-# what a number may do to a state or a control without a say in how the result depends on these
+# operations of a number with a state or a control that do not change how the result depends on these
 ARITHMETIC = frozenset({"add", "add_any", "sub", "mul", "div", "max", "min", "atan2", "dot_general", "concatenate"})
-CALLED = frozenset({"jit", "pjit"})  # JAX renamed the one to the other
-INSIDE = "."  # between the name of a function and that of what it reads
+CALLED = frozenset({"jit", "pjit"})  # the same primitive in different versions of JAX
+INSIDE = "."  # between the name of a function and the name that it reads
 FLOATS = (float, np.floating)
 NUMBERS = (int, float, np.integer, np.floating)
 
 
 def identity(thing: object, depth: int = 8) -> Hashable | None:
-    """What a part of a problem computes, if it reads nothing from outside but library code; None if it reads more.
+    """A value that is equal for parts of a problem that compute the same; None if a part reads data from outside.
 
-    Two parts of one identity compute alike: a lambda written again, a helper defined anew with the code of before.
+    For example a lambda written again, or a helper defined again with the same code.
     """
-    if depth == 0:  # functions that call each other have no end; None costs a trace and is never wrong
+    if depth == 0:  # functions may call each other without end; None costs a trace and is always correct
         return None
-    # numbers beside the leaves cannot change: a Partial keeps its own, and a dataclass of JAX's is frozen or copied
+    # numbers besides the leaves cannot change: a Partial keeps its own, and a JAX dataclass is frozen or copied
     if thing is None or isinstance(thing, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
         return "leaf"
     if isinstance(thing, Partial):
@@ -75,51 +75,51 @@ def _identities(things: Iterable[object], depth: int) -> Hashable | None:
 
 
 def _identity_of_function(function: types.FunctionType, depth: int) -> Hashable | None:
-    """A function's code, and the identities of the globals that it names; None if one may change between two solves."""
-    if function.__closure__ or function.__kwdefaults__:  # cells can be rebound, and dictionaries written to
+    """A function's code and the identities of its globals; None if one of these may change between two solves."""
+    if function.__closure__ or function.__kwdefaults__:  # cells can be rebound, and dictionaries are mutable
         return None
     if not all(isinstance(each, (int, float, str, type(None))) for each in function.__defaults__ or ()):
         return None
-    # CPython keeps names of globals and of attributes in one table; an attribute that is also a global costs a trace
+    # CPython keeps names of globals and attributes in one table; an attribute named like a global costs a trace
     known = function.__globals__
     outside = [known[name] for name in sorted(names_read(function.__code__)) if name in known]
     found = [
         each if _is_library(each) else identity(each, depth - 1) if isinstance(each, types.FunctionType) else None
         for each in outside
     ]
-    # printed, since 0.0 equals −0.0 and True; the code compares its own constants by type and bits
+    # by repr, since 0.0 equals −0.0 and True equals 1; code objects compare their constants by type and bits
     return None if None in found else (function.__code__, repr(function.__defaults__), tuple(found))
 
 
 def names_read(code: types.CodeType) -> set[str]:
-    """The names of globals, and of attributes, in a piece of code and in the functions defined inside it."""
+    """The names of globals and attributes in a piece of code and in the functions defined inside it."""
     inner = (names_read(each) for each in code.co_consts if isinstance(each, types.CodeType))
     return set(code.co_names).union(*inner)
 
 
 def _is_library(thing: object) -> bool:
-    """True if a global is a module, a function or a class of a library that nobody changes between two solves."""
+    """True if a global is a module, a function or a class of a library, which does not change between two solves."""
     if isinstance(thing, types.ModuleType):
         return _is_of_library(thing.__name__)
     home, name = getattr(thing, "__module__", None), getattr(thing, "__name__", None)
-    # an object of a library's class may hold anything, as functools.partial does: its module does not know it by name
+    # an object of a library's class, such as functools.partial, may hold anything; its module has no such name
     return _is_of_library(home) and thing is getattr(sys.modules.get(home), str(name), None)
 
 
 def _is_of_library(module: object) -> TypeGuard[str]:
-    """True if a module's name is one of a library's."""
+    """True if a module belongs to one of ``LIBRARIES``."""
     return isinstance(module, str) and module.split(".")[0] in LIBRARIES
 
 
 def code(function: Callable) -> object:
-    """What tells a function from another that was traced to the same jaxpr: its code, or itself if it has none."""
+    """The code of a function, or the function if it has none: it distinguishes functions with the same jaxpr."""
     return getattr(getattr(function, "__func__", function), "__code__", function)
 
 
 def fingerprint(jaxpr: jex.Jaxpr, consts: Iterable[Numbers] = ()) -> tuple[Hashable, bool]:
-    """A mark of what a jaxpr computes, with every number that it holds, and whether the mark tells all.
+    """A mark of what a jaxpr computes, including all its numbers, and True if the mark is complete.
 
-    A jaxpr does not say what rules of derivatives compute, unless they are JAX's own.
+    A jaxpr does not contain the computations of derivative rules, except for JAX's own.
     """
     account = _Account()
     account.take(jaxpr, consts)
@@ -127,7 +127,7 @@ def fingerprint(jaxpr: jex.Jaxpr, consts: Iterable[Numbers] = ()) -> tuple[Hasha
 
 
 class _Account:
-    """A digest of a jaxpr, the functions of the host that it calls, and whether it says all that the jaxpr computes."""
+    """A digest of a jaxpr, the host functions that it calls, and True if they describe the whole computation."""
 
     def __init__(self) -> None:
         self.digest = hashlib.blake2b(digest_size=16)  # two of 10^10 functions share 128 bits once in 10^18 cases
@@ -135,17 +135,17 @@ class _Account:
         self.whole = True
 
     def take(self, jaxpr: jex.Jaxpr, consts: Iterable[Numbers]) -> None:
-        """Put a jaxpr into the digest, equation by equation."""
-        numbers: dict[Any, int] = {}  # variables by their first appearance; their own names differ from trace to trace
+        """Add a jaxpr to the digest, equation by equation."""
+        numbers: dict[Any, int] = {}  # variables by first appearance, since their names differ between traces
         for var in (*jaxpr.constvars, *jaxpr.invars):
             self._tell(numbers.setdefault(var, len(numbers)), str(var.aval))
         for value in consts:
             self._number(value)
-        for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, as if an equation took them
+        for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, like the operands of an equation
             operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
             self._tell("" if eqn is None else eqn.primitive.name)
             for operand in operands:
-                if jaxprs.is_literal(operand):  # a number in the code, of which no variable tells
+                if jaxprs.is_literal(operand):  # a number in the code, without a variable
                     self._number(operand.val)
                 else:
                     self._tell(numbers.get(operand, -1))
@@ -179,7 +179,7 @@ class _Account:
             self._tell(ADDRESS.sub("", repr(value)))
 
     def _number(self, value: Numbers) -> None:
-        array = np.asarray(value)  # its bits, since a printed one is rounded and a long one abridged
+        array = np.asarray(value)  # its bits, since printing rounds numbers and abridges long arrays
         self._tell(array.dtype, array.shape)
         self.digest.update(array.tobytes())
 
@@ -188,20 +188,20 @@ class _Account:
 
 
 def _is_rule_of_jax(parameters: dict[str, Any]) -> bool:
-    """True if the function whose derivative has a rule of its own is one of JAX's, as relu is."""
+    """True if a function with a custom derivative rule belongs to JAX, such as relu."""
     inner = parameters.get("call_jaxpr", parameters.get("fun_jaxpr"))
-    info = getattr(getattr(inner, "jaxpr", None), "debug_info", None)  # JAX promises none of these names
+    info = getattr(getattr(inner, "jaxpr", None), "debug_info", None)  # private names, which may change in JAX
     where = re.search(r" at (.*):\d+$", getattr(info, "func_src_info", None) or "")
     return where is not None and Path(where[1]).is_relative_to(Path(jax.__file__).parent)
 
 
 def _called(callback: object) -> Hashable:
-    """What tells a function of the host from another: its code, where it holds nothing beside, or itself."""
+    """An identity of a host function: its code if it reads nothing else, otherwise the function."""
     function = getattr(callback, "callback_func", callback)
     if isinstance(function, types.FunctionType) and not (
         function.__closure__ or function.__defaults__ or function.__kwdefaults__
     ):
-        return function.__code__, id(function.__globals__)  # a lambda inside the drift is a new one in every trace
+        return function.__code__, id(function.__globals__)  # a lambda inside the drift is a new object in every trace
     return function
 
 
@@ -209,9 +209,9 @@ class OfNumbers:
     """A function of the numbers that it reads under ``names``, and of its own arguments."""
 
     def __init__(self, function: Callable, names: Sequence[str]):
-        assert isinstance(function, types.FunctionType)  # others read nothing by name
+        assert isinstance(function, types.FunctionType)  # other callables read nothing by name
         self.function, self.names = function, tuple(names)
-        self.__code__ = function.__code__  # which tells it from others, beside its mark
+        self.__code__ = function.__code__  # distinguishes it from others, together with its mark
         own = inspect.signature(function)
         first = inspect.Parameter("numbers", inspect.Parameter.POSITIONAL_ONLY)
         self.__signature__ = own.replace(parameters=[first, *own.parameters.values()])
@@ -223,16 +223,16 @@ class OfNumbers:
         return hash((self.function, self.names))
 
     def __reduce__(self) -> tuple[type, tuple[Callable, tuple[str, ...]]]:
-        """Pickle what it was made of: the code object of a function cannot be pickled."""
+        """Pickle the function and the names, because a code object cannot be pickled."""
         return OfNumbers, (self.function, self.names)
 
     def __call__(self, numbers: tuple, *arguments: Any, **options: Any) -> Any:
-        """What the function returns where it reads ``numbers``."""
+        """The function's result if it reads ``numbers``."""
         return _reading(self.function, dict(zip(self.names, numbers, strict=True)))(*arguments, **options)
 
 
 def _reading(function: types.FunctionType, numbers: dict[str, Any]) -> types.FunctionType:
-    """A function written again that reads ``numbers`` by their names; ``helper.name`` in a function that it names."""
+    """A copy of a function that reads ``numbers`` by name; ``helper.name`` is a name in a function that it calls."""
     values: dict[str, Any] = {}
     for name, number in numbers.items():
         helper, _, inner = name.partition(INSIDE)
@@ -255,9 +255,9 @@ def _reading(function: types.FunctionType, numbers: dict[str, Any]) -> types.Fun
 
 
 def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 3) -> dict[str, np.ndarray]:
-    """Numbers of these kinds and real arrays in the cells and globals that a function's own code names.
+    """Numbers of these kinds, and real arrays, in the cells and globals that a function's own code names.
 
-    And those of functions in its cells, as ``helper.name``: a drift that calls one made a line above.
+    Functions in its cells are included, as ``helper.name``: a drift may call a helper defined next to it.
     """
     if depth == 0 or not isinstance(function, types.FunctionType) or _writes(function.__code__):
         return {}
@@ -270,9 +270,9 @@ def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 3) ->
 
 
 def _read(function: types.FunctionType) -> dict[str, Any]:
-    """What the globals and the cells hold that a function's own code names.
+    """The values of the globals and the cells that a function's own code names.
 
-    A global whose name is an attribute's in the code is found as well, and then not read: no harm.
+    A global with the name of an attribute is found too, and then not read, which is harmless.
     """
     found = {name: function.__globals__.get(name) for name in names_read(function.__code__)}
     return found | {
@@ -282,7 +282,7 @@ def _read(function: types.FunctionType) -> dict[str, Any]:
 
 
 def _writes(code: types.CodeType) -> bool:
-    """True if code rebinds a global or a name of the functions around it, of which copies would know nothing."""
+    """True if code rebinds a global or a name of an enclosing function, which a copy would miss."""
     for each in dis.get_instructions(code):
         if each.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
             return True
@@ -292,7 +292,7 @@ def _writes(code: types.CodeType) -> bool:
 
 
 def content(cell: types.CellType) -> object:
-    """What a cell holds; None while it is empty."""
+    """The content of a cell; None if it is empty."""
     try:
         return cell.cell_contents
     except ValueError:
@@ -300,22 +300,22 @@ def content(cell: types.CellType) -> object:
 
 
 def _is_number(thing: object, kinds: tuple[type, ...]) -> bool:
-    """True for a number of these kinds, and for an array of real numbers that is known."""
+    """True for a number of these kinds, and for a known array of real numbers."""
     if isinstance(thing, (np.ndarray, jax.Array)):
         return not is_traced(thing) and np.issubdtype(thing.dtype, np.floating)
     return isinstance(thing, kinds) and not isinstance(thing, bool)
 
 
 def decisive(jaxpr: jex.Jaxpr, variables: Sequence[jex.Var]) -> set[int]:
-    """Positions of the variables that do more than arithmetic to the jaxpr's other arguments."""
+    """Positions of the variables that are used for more than arithmetic with the jaxpr's other arguments."""
     owners = {var: frozenset([position]) for position, var in enumerate(variables)}
     return set(_follow(jaxpr, owners)[0])
 
 
 def _follow(jaxpr: jex.Jaxpr, owners: dict[jex.Var, frozenset[int]]) -> tuple[set[int], list[frozenset[int]]]:
-    """Positions that decide something, and those that each output is a number of.
+    """Positions of the decisive variables, and for each output the positions it was made from.
 
-    ``owners``: for each variable that is a number, known before any state is, the positions it was made from.
+    ``owners``: for each variable that is known before any state, the positions it was made from.
     """
     deciding: set[int] = set()
     for eqn in jaxpr.eqns:
@@ -333,5 +333,5 @@ def _follow(jaxpr: jex.Jaxpr, owners: dict[jex.Var, frozenset[int]]) -> tuple[se
             owners |= {var: each for var, each in zip(eqn.outvars, results, strict=True) if each}
         elif touched and eqn.primitive.name not in ARITHMETIC:
             deciding |= touched
-    ends = [owners.get(cast("jex.Var", each), frozenset()) for each in jaxpr.outvars]  # literals own nothing
+    ends = [owners.get(cast("jex.Var", each), frozenset()) for each in jaxpr.outvars]  # literals have no owners
     return deciding, ends

@@ -1,12 +1,11 @@
-"""Vectors of one state over all nodes: as an array of objects, one a component, or, where they are long, as one array.
+"""Vectors of one state over all nodes: an object array with one array per component, or one array for long vectors.
 
-Component by component is the fast way through a drift of a few states. A layer of a neural network is another matter:
-a product with a 32 x 32 matrix is 2,000 scalar operations, each an array of its own, and XLA takes minutes over a few
-layers. So a product with a large matrix stays one contraction, and what is done to a long vector stays one operation
-on a ``Stack``: an array (*shape, *nodes), the entries in front. What becomes short again, as the drift at the end, is
-taken apart, and goes on by components.
+Components are fast for a drift of a few states. In a layer of a neural network, however, a product with a 32 x 32
+matrix is 2,000 scalar operations, each on its own array, and XLA takes minutes to compile a few layers. So a product
+with a large matrix stays one contraction, and an operation on a long vector stays one operation on a ``Stack``, an
+array (*shape, *nodes). A result that is short again, such as the drift at the end, is split into components.
 
-Small matrices, as in mechanics and in linear systems, never get here.
+Small matrices, as in mechanics and in linear systems, never become stacks.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from hjbjax.tracing.jaxprs import CUMULATIVE, ENTRYWISE, MOVES, REDUCTIONS, SCAT
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-MANY = 60  # entries of the largest operand or result, above which an equation is one operation: 7 x 7 and less are not
-LONG = 16  # entries above which a vector stays one array; the few of a drift are worth an array each
+MANY = 60  # an equation with more entries in its largest operand or result is one operation; 7 x 7 is below
+LONG = 16  # a vector with more entries stays one array; the few entries of a drift are faster as separate arrays
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +34,8 @@ class Stack:
     """All entries of a vector, or of a matrix, in one array over the nodes.
 
     Attributes:
-      array: (*shape, *nodes); the axes of the nodes are those of the grid, of length 1 where nothing varies, or none.
-      shape: of the vector or matrix.
+      array: (*shape, *nodes); the node axes are the axes of the grid, of length 1 where nothing varies, or absent.
+      shape: the shape of the vector or matrix.
     """
 
     array: jax.Array
@@ -48,27 +47,27 @@ class Stack:
         return self.array.shape[len(self.shape) :]
 
     def entries(self) -> np.ndarray:
-        """An object array with one array over the nodes an entry."""
+        """An object array with one array over the nodes per entry."""
         rows = self.array.reshape(math.prod(self.shape), *self.nodes)
         return object_array([jax.lax.index_in_dim(rows, k, keepdims=False) for k in range(len(rows))], self.shape)
 
     def over(self, nodes: tuple[int, ...]) -> jax.Array:
         """The array (*shape, *nodes) over more nodes."""
-        missing = len(nodes) - len(self.nodes)  # none, or all: a vector that is the same at all nodes
+        missing = len(nodes) - len(self.nodes)  # none, or all for a vector that is the same at all nodes
         aligned = self.array.reshape(*self.shape, *(1,) * missing, *self.nodes)
         return jnp.broadcast_to(aligned, (*self.shape, *nodes))
 
 
 def object_array(entries: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """An array of objects of a shape, whatever the entries are."""
-    array = np.empty(len(entries), dtype=object)  # np.array(entries) would look into entries that are arrays
+    """An array of objects with the given shape, for entries of any kind."""
+    array = np.empty(len(entries), dtype=object)  # np.array(entries) would unpack entries that are arrays
     for index, entry in enumerate(entries):
         array[index] = entry
     return array.reshape(shape)
 
 
 def is_components(value: object) -> TypeGuard[np.ndarray]:
-    """True if an operand is an object array, one entry a component."""
+    """True if an operand is an object array, with one entry per component."""
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
@@ -78,14 +77,14 @@ def varies(value: object) -> TypeGuard[np.ndarray | Stack]:
 
 
 def results(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> list | None:
-    """Results of an equation on long vectors, by one operation on all entries; None where components are better.
+    """Results of an equation on long vectors, by one operation on all entries; None if components are better.
 
     Args:
-      eqn: the equation, of a jaxpr of one state, no call and no ``cond`` whose branch is known.
+      eqn: the equation of a jaxpr of one state; not a call, nor a ``cond`` with a known branch.
       operands: stacks, object arrays, and numbers that hold at all nodes.
 
     Returns:
-      One value an output: a stack, or an object array where it is short.
+      One value per output: a stack, or an object array if it is short.
     """
     name = eqn.primitive.name
     if not is_whole(eqn, any(isinstance(value, Stack) for value in operands)):
@@ -103,10 +102,10 @@ def results(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> list | None:
 
 
 def is_whole(eqn: jex.JaxprEqn, with_stacks: bool) -> bool:
-    """True if an equation is one operation on all entries: one of its operands is a stack, or it is large."""
+    """True if an equation is one operation on all entries: an operand is a stack, or the equation is large."""
     if with_stacks:
         return True
-    # moving entries about costs nothing; what is done to them next is one operation then
+    # moving entries costs nothing; the next operation on them is then one operation
     name = eqn.primitive.name
     if not (name in ENTRYWISE or name in _BY_AXES or name in ("dot_general", "custom_jvp_call")):
         return False
@@ -118,18 +117,18 @@ def is_long(shape: tuple[int, ...]) -> bool:
     return math.prod(shape) > LONG
 
 
-# entries are in front, so that axes of one state are axes of the stack: the equation is bound as it stands
+# entries come first, so the axes of one state are axes of the stack and the equation is bound unchanged
 _BY_AXES = frozenset(REDUCTIONS) | frozenset(CUMULATIVE)
 RULES = ENTRYWISE | _BY_AXES | frozenset(MOVES) | frozenset(SCATTERS) | {"dot_general", "custom_jvp_call", "cond"}
 
 
 def stacked(value: np.ndarray | Stack | Numbers, dtype: DType) -> Stack:
-    """An operand as a stack; over no nodes where it holds at all of them."""
+    """An operand as a stack, without node axes if it holds at all nodes."""
     if isinstance(value, Stack):
         return Stack(jnp.asarray(value.array, dtype), value.shape)
     if not is_components(value):
         return Stack(jnp.asarray(value, dtype), np.shape(value))
-    unique = {id(entry): entry for entry in value.flat}  # a row that was repeated is stacked once
+    unique = {id(entry): entry for entry in value.flat}  # repeated rows are stacked once
     arrays = [jnp.asarray(entry, dtype) for entry in unique.values()]
     nodes = np.broadcast_shapes(*(array.shape for array in arrays))
     rows = jnp.stack([jnp.broadcast_to(array, nodes) for array in arrays])
@@ -156,7 +155,7 @@ def over_nodes(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> list[Stack]:
 
 
 def _entrywise(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> Stack:
-    """The result of a primitive that acts entry by entry; a scalar beside a vector stands for all of its entries."""
+    """The result of a primitive that acts entry by entry; a scalar combined with a vector is used for all entries."""
     stacks = [stacked(value, array_type(var).dtype) for value, var in zip(operands, eqn.invars, strict=True)]
     shape = array_type(eqn.outvars[0]).shape
     nodes = np.broadcast_shapes(*(value.nodes for value in stacks))
@@ -169,17 +168,17 @@ def _entrywise(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> Stack:
 
 
 def _contraction(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> Stack:
-    """``dot_general`` with numbers that hold at all nodes: one product for all of them."""
+    """``dot_general`` with numbers that hold at all nodes: one product for all nodes."""
     left, right = (stacked(value, array_type(var).dtype) for value, var in zip(operands, eqn.invars, strict=True))
     (contract_l, contract_r), (batch_l, batch_r) = eqn.params["dimension_numbers"]
-    # unrolled sums were in full precision; a GPU would take 10 bits of float32 where nobody asked for more
+    # full precision, as in unrolled sums; by default a GPU would use 10 bits of float32
     params = eqn.params | {"precision": eqn.params["precision"] or jax.lax.Precision.HIGHEST}
     shape = array_type(eqn.outvars[0]).shape
-    if varies(operands[1]):  # the free axes of the right come last, and of these the nodes
+    if varies(operands[1]):  # the free axes of the right operand come last, with the nodes at the end
         return Stack(eqn.primitive.bind(left.array, right.array, **params), shape)
     params["dimension_numbers"] = ((contract_r, contract_l), (batch_r, batch_l))
     product = eqn.primitive.bind(right.array, left.array, **params)
-    # (batch, free of the right, free of the left, nodes): the left goes first
+    # (batch, free of the right, free of the left, nodes): move the left axes first
     batch, columns = len(batch_l), len(right.shape) - len(contract_r) - len(batch_r)
     rows = len(shape) - batch - columns
     return Stack(

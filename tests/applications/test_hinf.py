@@ -484,7 +484,7 @@ def test_the_energies_are_those_of_simulate(top, energies):
         ({"problem": OSCILLATOR.plant()}, ValueError, r"wanted a game with a cost"),
         ({"problem": dataclasses.replace(OSCILLATOR.game()(1.0), noise=0.1)}, ValueError, r"holds in the mean only"),
         ({"x0s": [[0.0, 0.0, 0.0]]}, ValueError, r"x0s has shape \(1, 3\), wanted \(k, 2\)"),
-        ({"x0s": [[0.0, 2.0]]}, ValueError, r"a start lies outside the grid"),
+        ({"x0s": [[0.0, 2.0]]}, ValueError, r"a start is outside the grid"),
         ({"duration": 0.0}, ValueError, r"duration is 0.0"),
         ({"random": -1}, ValueError, r"random is -1"),
         ({"disturbances": [1.0]}, TypeError, r"got 1.0 among the disturbances"),

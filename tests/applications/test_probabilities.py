@@ -458,8 +458,8 @@ def test_bad_questions_are_refused(changes, error, reason):
     ("times", "reason"),
     [
         ([0.0], r"_probability: horizon = 5 goes beyond the horizon 0 of the solution"),
-        ([0.0, 5.0], r"_probability: horizon = 5, but the solution was marched and kept at 2 times"),
-        (np.linspace(1, 5, 41), r"kept at 41 times from 1 to 5"),
+        ([0.0, 5.0], r"_probability: horizon = 5, but the solution was marched and stored at 2 times"),
+        (np.linspace(1, 5, 41), r"stored at 41 times from 1 to 5"),
     ],
 )
 def test_a_marched_feedback_that_is_not_known_up_to_the_horizon_is_refused(times, reason):

@@ -59,7 +59,7 @@ def test_what_is_no_kind_of_end_is_refused(edges, words):
 def test_where_no_such_end_can_be():
     with pytest.raises(ValueError, match=r"(?s)axis 0 is periodic and has no ends; got 'open'"):
         hjb.Grid([0.0, 0.0], [1.0, 1.0], (5, 5), (True, False), edges=("open", "open"))
-    with pytest.raises(ValueError, match="axis 0 has 2 points; an open end continues the last three"):
+    with pytest.raises(ValueError, match="axis 0 has 2 points; an open end extends V from the last three"):
         hjb.Grid([0.0], [1.0], (2,), edges="open")
 
 

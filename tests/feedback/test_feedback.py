@@ -125,7 +125,7 @@ def test_it_is_blind_where_the_value_is_infinite_and_refuses_what_is_no_solution
         greedy_feedback(solution, problem)
     with pytest.raises(ValueError, match="nothing to choose"):
         greedy_feedback(Problem(lambda x, u: -x), solution)
-    with pytest.raises(ValueError, match="players are others"):
+    with pytest.raises(ValueError, match="its players differ"):
         greedy_feedback(Problem(lambda x, u: u, None, Box([-1.0] * 2, [1.0] * 2)), solution)
     with pytest.raises(ValueError, match="no batch"):
         greedy_feedback(problem, Solution(grid, np.stack([value, value]), np.zeros((2, 11, 1))))

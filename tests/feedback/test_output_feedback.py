@@ -248,7 +248,7 @@ def test_the_terminal_cost_is_paid_at_the_end_alone():
 
 def test_a_loop_that_fails_says_so():
     problem = Problem(lambda x, u: x**3)
-    with pytest.warns(UserWarning, match="the path stopped before a step to no finite state"):
+    with pytest.warns(UserWarning, match="the path stopped before a state or estimate that is not finite"):
         path = simulate_output(problem, Memory0(), None, **options(x0=[4.0], h=lambda x: x))
     assert path.status is PathStatus.NONFINITE
     assert np.all(np.isfinite(path.states))
@@ -471,7 +471,11 @@ REFUSED = [
     (ValueError, lambda: closed(h=lambda x: x), "the observer does not take a control of shape (1,)"),
     (ValueError, lambda: closed(control=lambda s: s.mean), "control has shape (2,), wanted (1,)"),
     (ValueError, lambda: closed(observer=Blind([0.0]), control=lambda s: s), "estimate has shape (1,), wanted (2,)"),
-    (ValueError, lambda: closed(observer=Grows(), control=lambda s: s["seen"]), "wanted that of initial()"),
+    (
+        ValueError,
+        lambda: closed(observer=Grows(), control=lambda s: s["seen"]),
+        "wanted the one that initial()",
+    ),
     (ValueError, lambda: closed(grid=Grid([0.0], [1.0], (5,))), "wanted a Grid of 2 axes"),
     (ValueError, lambda: closed(Problem(integrator, controls=REACH, running_max=lambda x: x[0])), "a running_max"),
     (ValueError, lambda: closed(Problem(lambda x, u: -x)), "got a control, but problem.controls is None"),

@@ -139,7 +139,7 @@ def test_a_target_that_moves_is_met_by_a_marched_feedback_on_a_line():
 
 def test_a_feedback_of_nan_is_blamed_and_not_the_state():
     problem = Problem(velocity, one, Ball(1.0, 1))
-    with pytest.warns(UserWarning, match=r"feedback are not finite ahead at t = 0\.\d+, x = \[0\.\d+\]"):
+    with pytest.warns(UserWarning, match=r"feedback are not finite at t = 0\.\d+, x = \[0\.\d+\]"):
         path = simulate(problem, lambda x: jnp.where(x > 0.52, jnp.nan, 1.0), [0.0], 1.0, steps=10)
     assert path.status == PathStatus.NONFINITE
     assert path.states[-1, 0] == pytest.approx(0.5)

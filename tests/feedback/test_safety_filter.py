@@ -216,9 +216,9 @@ def test_against_the_worst_disturbance():
         ({"solution": AVOID}, {}, TypeError, r"got Problem, wanted the Solution of a tube"),
         ({"margin": -0.1}, {}, ValueError, r"margin = -0.1; wanted a finite number ≥ 0"),
         ({"margin": np.nan}, {}, ValueError, r"margin = nan"),
-        ({"margin": 50.0}, {}, ValueError, r"nothing is safe by the margin 50: the least V is -3"),
+        ({"margin": 50.0}, {}, ValueError, r"nothing is safe by the margin 50: the smallest V is -3"),
         ({}, {"policy": np.zeros((61, 61, 0))}, ValueError, r"the tube has no controls"),
-        ({}, {"code": hjb.Status.MAX_STEPS}, ValueError, r"ended as <Status.MAX_STEPS.*>, so that it promises nothing"),
+        ({}, {"code": hjb.Status.MAX_STEPS}, ValueError, r"ended with <Status.MAX_STEPS.*>, so it guarantees nothing"),
     ],
 )
 def test_what_guards_nothing_is_refused(tube, arguments, changes, error, reason):
@@ -231,7 +231,7 @@ def test_what_guards_nothing_is_refused(tube, arguments, changes, error, reason)
 
 def test_a_marched_tube_that_is_kept_at_one_time_is_refused(tube):
     once = hjb.Solution(GRID, tube.value[None], tube.policy[None], code=tube.code, times=np.zeros(1))
-    with pytest.raises(ValueError, match=r"marched and kept at one time only.* times=np.linspace"):
+    with pytest.raises(ValueError, match=r"marched and stored at one time only.* times=np.linspace"):
         hjb.least_restrictive(once, full_throttle)
 
 

@@ -388,7 +388,7 @@ def test_noise_that_does_not_act_across_the_edge_leaves_the_interpolant_to_say_w
 
 def test_faults_end_the_path_with_a_status_and_a_warning():
     bang = Problem(lambda x, u: x**2, one)
-    with pytest.warns(UserWarning, match="no finite state"):
+    with pytest.warns(UserWarning, match="a state that is not finite"):
         path = simulate(bang, None, [1.0], 2.0, steps=20)  # 1/(1 − t)
     assert path.status == PathStatus.NONFINITE
     assert np.all(np.isfinite(path.states))
@@ -412,7 +412,7 @@ BOX2 = Grid([-1.0, -1.0], [1.0, 1.0], (3, 3))
     [
         (LQ, state_feedback, [1.0, np.nan], {}, "finite"),
         (LQ, state_feedback, [[1.0, 0.0]], {}, "shape"),
-        (LQ, state_feedback, "here", {}, "one number a state"),
+        (LQ, state_feedback, "here", {}, "one number per state"),
         (LQ, state_feedback, [0.5], {"grid": BOX2}, r"\(1,\), wanted \(2,\)"),
         (PLAIN, toward_zero, [1.0, 2.0], {"feedback": lambda x: x[:1]}, r"cost returned|drift returned shape \(1,\)"),
         (PLAIN, toward_zero, [1.0], {"duration": 0.0}, "duration"),
@@ -447,7 +447,7 @@ BOX2 = Grid([-1.0, -1.0], [1.0, 1.0], (3, 3))
         (GAME, toward_zero, [1.0], {"disturbance": lambda x: x[0]}, r"disturbance returned shape \(\)"),
         (PLAIN, lambda x: x[0], [1.0], {}, r"feedback returned shape \(\), expected \(1,\)"),
         (PLAIN, lambda x: -x if x[0] > 0 else x, [1.0], {}, "jnp.where"),
-        (PLAIN, lambda x: np.sign(np.asarray(x)), [1.0], {}, "use jnp in place of np"),
+        (PLAIN, lambda x: np.sign(np.asarray(x)), [1.0], {}, "use jnp instead of np"),
         (LQ, Answer(BOX2, np.zeros((4, 3, 3, 1)), times=np.arange(4.0)), [0.5, 0.5], {}, "marched"),
     ],
 )

@@ -346,5 +346,5 @@ def test_what_is_no_hidden_chain_is_refused(changes, reason):
 
 def test_sensors_without_common_axes_are_refused_with_the_way_out():
     chain = worn()
-    with pytest.raises(ValueError, match="no common axes, wanted .* that commute: with 3 states"):
+    with pytest.raises(ValueError, match="no common axes, wanted .* that commute. With 3 states"):
         posed(chain, lambda u: jnp.stack([1 + u[0], 1 - u[0], 0 * u[0]]))

@@ -474,12 +474,12 @@ FLAT = known(LINE, 0 * X)
         (
             ValueError,
             lambda: averaged_hamiltonian(hjb.attenuation(QUIET, 2.0, WIDE), FLAT, FILTER),
-            r"got a problem with disturbances, wanted one player .* see minimum_stress",
+            r"got a problem with disturbances, wanted one player .* use minimum_stress",
         ),
         (
             ValueError,
             lambda: averaged_hamiltonian(QUIET, known(hjb.Grid([-1.0], [1.0], (5,)), np.zeros(5)), FILTER),
-            r"the filter's box from \[-6.0\] to \[6.0\] leaves that of the solution, \[-1.0\] to \[1.0\]",
+            r"the filter's box from \[-6.0\] to \[6.0\] leaves the solution's box from \[-1.0\] to \[1.0\]",
         ),
         (
             ValueError,

@@ -301,7 +301,7 @@ REFUSED = [
     (lambda: kalman(r=np.nan), "wanted finite numbers > 0"),
     (lambda: kalman(r=[1.0, 2.0]), "has shape (2,), wanted a number, (1,) or (1, 1)"),
     (lambda: ExtendedKalman(PROBLEM, lambda x: x[0], START, PRIOR), "of shape (), wanted"),
-    (lambda: ExtendedKalman(PROBLEM, lambda x: x[:3] * x[5], START, PRIOR), "h(x) asks for"),
+    (lambda: ExtendedKalman(PROBLEM, lambda x: x[:3] * x[5], START, PRIOR), "h(x) reads"),
     (lambda: ExtendedKalman(PROBLEM, lambda x: x @ x[:1], START, PRIOR), "h(x) failed on one state"),
     (lambda: ExtendedKalman(PROBLEM, lambda x: x if x[0] > 0 else -x, START, PRIOR), "h(x) decides by Python `if`"),
     (lambda: ExtendedKalman(PROBLEM, PLANT.h, START, [[1.0, 2.0], [2.0, 1.0]]), "without negative eigenvalues"),

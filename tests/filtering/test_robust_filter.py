@@ -306,7 +306,7 @@ GAME = hjb.Problem(lambda x, u, d: u + d, None, hjb.Box([-1.0], [1.0]), disturba
         ({"initial": np.zeros(40)}, r"initial has shape \(40,\), wanted \(41,\)"),
         (
             {"grid": hjb.Grid([-4.0], [4.0], (41,), edges="open")},
-            r"got a grid with open ends, through which p would flow in",
+            r"got a grid with open ends, through which unknown values of p would flow in",
         ),
         ({"grid": hjb.Grid([-4.0], [4.0], (5,))}, r"axis 0 has 5 points; Weno5 needs at least 7"),
         ({"sigma": -1.0}, r"sigma = -1.0; wanted finite numbers ≥ 0"),
@@ -352,7 +352,7 @@ def test_an_interval_of_too_many_inner_steps_is_refused():
         )
 
     assert np.all(np.isfinite(filtered(2.6e4).p))
-    with pytest.raises(ValueError, match=r"dt = 27000 asks for over 100000 inner steps.* give a shorter one"):
+    with pytest.raises(ValueError, match=r"dt = 27000 needs more than 100000 inner steps.* use a shorter interval"):
         filtered(2.7e4)
 
 

@@ -143,7 +143,7 @@ def test_equal_exact_sensors_leave_a_law_on_a_grid():
     np.testing.assert_allclose(law.mean[-1], 0.5, atol=0.05)
     assert np.all(np.isfinite(law.covariance))
     record = np.full((1, 2), 0.5)
-    with pytest.raises(ValueError, match="asks for over"):
+    with pytest.raises(ValueError, match="needs more than"):
         F.robust_filter(PLANT, twice, GRID, record, 0.01, lambda x: -x @ x, gamma=2.0, measurement_noise=1e-9)
 
 

@@ -132,9 +132,9 @@ def test_a_law_that_is_narrower_than_a_cell_is_warned_of():
     texts = [str(each.message) for each in said]
     assert len(texts) == 2
     assert "zakai: dt = 0.01 is longer than r/(σ|h'|) = 0.002" in texts[0]
-    assert "Take dt of at most 0.002." in texts[0]
+    assert "Use dt of at most 0.002." in texts[0]
     assert "narrower than a cell of axis 0, whose spacing is 0.1" in texts[1]
-    assert "Take a spacing of at most 0.017 there" in texts[1]
+    assert "Use a spacing of at most 0.017 there" in texts[1]
 
 
 def test_what_the_warnings_name_is_enough():

@@ -42,7 +42,7 @@ def test_the_tube_of_avoid_says_on_which_side_it_is():
 @pytest.mark.parametrize(
     ("options", "error", "reason"),
     [
-        ({"control_names": ("a", "b")}, ValueError, r"Problem.control_names: got .*2 texts for 1; wanted one each"),
+        ({"control_names": ("a", "b")}, ValueError, r"Problem.control_names: got .*2 texts for 1; wanted one for each"),
         ({"control_units": "N m"}, TypeError, r"Problem.control_units: got 'N m', wanted a tuple of texts"),
         ({"inside": "under"}, ValueError, r"Problem.inside: got 'under', wanted 'below'"),
     ],

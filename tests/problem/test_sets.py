@@ -74,7 +74,7 @@ def test_ball_refuses(radius, dim, words):
         ([], "no admissible control"),
         (np.zeros((0, 2)), "no admissible control"),
         (np.zeros((2, 0)), "no admissible control"),
-        ([1.0, 2.0], "wanted \\(K, m\\): one row a control"),
+        ([1.0, 2.0], "wanted \\(K, m\\): one row per control"),
         (3.0, "no admissible control"),
         ([[float("nan")]], "wanted finite numbers"),
     ],

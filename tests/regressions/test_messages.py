@@ -182,7 +182,7 @@ def test_bounds_without_a_box_are_told_how_to_become_one():
     [
         (lambda x, u: jnp.stack([x[1], u]), r"u\[0\] is the number$"),
         (lambda x, u: jnp.stack([x[:, 1], u[:, 0]], -1), r"x is one state, without an axis for a batch"),
-        (lambda x, u: np.stack([x[1], u[0]]), "use jnp in place of np"),
+        (lambda x, u: np.stack([x[1], u[0]]), "use jnp instead of np"),
         (lambda x, u: written(x, u), r"setting an array element[\s\S]*use jnp.stack\(\[...\]\)$"),
     ],
 )
@@ -206,8 +206,8 @@ def test_a_drift_of_the_wrong_shape_or_kind_is_told_what_to_change(drift, cure):
 )
 def test_other_functions_of_the_user_are_told_what_to_change_too(ask, said):
     for function, cure in (
-        (lambda x: np.hypot(x[0], x[0]), "use jnp in place of np"),
-        (lambda x: math.exp(x[0]), "needs a traced value as a number: use jnp in place of np, math"),
+        (lambda x: np.hypot(x[0], x[0]), "use jnp instead of np"),
+        (lambda x: math.exp(x[0]), "needs a traced value as a number: use jnp instead of np, math"),
         (lambda x: x[0] if x[0] > 0 else -x[0], "use jnp.where"),
     ):
         with pytest.raises(ValueError, match=said + r"[\s\S]*" + cure) as caught:
@@ -237,8 +237,11 @@ def test_functions_of_another_shape_are_refused_where_nothing_else_would_tell():
         (lambda: hjb.chain.generator(GRID, problem()), "generator: got Grid, Problem; wanted a Problem and a Grid"),
         (lambda: hjb.attenuation(GRID, 1.0, U), "attenuation: got Grid, wanted a Problem"),
         (lambda: hjb.solve_batch([problem(), 3], GRID), "solve_batch: lane 1 is 3; wanted problems alone"),
-        (lambda: hjb.Grid([0.0], [1.0], (3,), stretch="sinh"), "Grid.stretch: got 'sinh', wanted one an axis"),
-        (lambda: hjb.Grid([0.0], [1.0], (3,), stretch=hjb.Sinh(3.0)), r"wanted one an axis, as in \(hjb.Sinh\(3.0\)"),
+        (lambda: hjb.Grid([0.0], [1.0], (3,), stretch="sinh"), "Grid.stretch: got 'sinh', wanted one entry per axis"),
+        (
+            lambda: hjb.Grid([0.0], [1.0], (3,), stretch=hjb.Sinh(3.0)),
+            r"wanted one entry per axis, as in \(hjb.Sinh\(3.0\)",
+        ),
     ],
 )
 def test_arguments_that_changed_places_are_told(ask, said):
@@ -252,7 +255,7 @@ def test_a_batch_names_the_lane_of_a_refusal():
 
 
 def test_a_vector_field_in_numpy_is_told_what_to_change():
-    with pytest.raises(ValueError, match="hands a traced value to NumPy: use jnp in place of np"):
+    with pytest.raises(ValueError, match="passes a traced value to NumPy: use jnp instead of np"):
         hjb.geometry.lie_bracket(lambda x: np.array([x[1], 0.0]), lambda x: x)(jnp.zeros(2))
 
 
@@ -291,7 +294,7 @@ def test_a_path_is_one_line_and_a_missing_file_is_what_python_calls_it(tmp_path)
         (lambda x, u: jnp.zeros(3), r"drift\(x, u\) returned shape \(3,\), expected \(1,\)"),
         (lambda x, u: u if x[0] > 0 else -u, "use jnp.where"),
         (lambda x, u: x[2:3], None),
-        (lambda x, u: jnp.stack([u[3]]), "asks for entry 3 of u"),
+        (lambda x, u: jnp.stack([u[3]]), "reads entry 3 of u"),
     ],
     ids=["list", "shape", "if", "slice", "index"],
 )

@@ -193,7 +193,7 @@ def test_a_value_that_is_wrong_is_a_promise_that_is_broken():
 
 def test_a_filter_wants_a_tube():
     problem, grid = hjb.zoo.eikonal(shape=(21, 21))
-    with pytest.raises(ValueError, match="another problem than a tube"):
+    with pytest.raises(ValueError, match="a problem that is not a tube"):
         hjb.least_restrictive(hjb.solve(problem, grid), lambda x: jnp.zeros(2))
 
 

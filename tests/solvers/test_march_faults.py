@@ -205,7 +205,7 @@ def test_traced_use_wants_a_step():
 @pytest.mark.slow
 def test_a_marched_feedback_must_be_known_densely_enough():
     few = hjb.march(LQ, GRID, 1.0, times=[0.0, 1.0], scheme=hjb.Upwind(split=True))
-    with pytest.raises(ValueError, match=r"kept at 2 times from 0 to 1; a feedback up to t = 1 wants all of that"):
+    with pytest.raises(ValueError, match=r"stored at 2 times from 0 to 1; a feedback up to t = 1 needs times"):
         hjb.simulate(LQ, few, [1.0], 1.0)
     with pytest.raises(ValueError, match=r"duration = 2 goes beyond the horizon 1"):
         hjb.simulate(LQ, few, [1.0], 2.0)

@@ -107,7 +107,7 @@ def test_target_without_a_node_and_target_everywhere():
         (lambda x, u: "fast", ("'fast'", "(2,)")),
         (lambda x, u: x * 1j, ("complex", "(2,)")),
         (lambda x, u: x if x[0] > 0 else -x, ("jnp.where",)),
-        (lambda x, u: np.sin(np.asarray(x)), ("jnp in place of np",)),
+        (lambda x, u: np.sin(np.asarray(x)), ("jnp instead of np",)),
         (lambda x: x, ("drift(x, u)",)),
     ],
     ids=["shape", "list", "none", "string", "complex", "if", "numpy", "arity"],

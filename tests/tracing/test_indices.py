@@ -55,7 +55,7 @@ WITHIN = {
 @pytest.mark.parametrize("name", BEYOND)
 def test_beyond(name):
     function, words = BEYOND[name]
-    message = refused("shapes", r"^drift\(x, u\) asks for ", drift=function)
+    message = refused("shapes", r"^drift\(x, u\) reads ", drift=function)
     assert words in message
 
 
@@ -70,7 +70,7 @@ def test_every_ingredient(name):
     def function(x, *rest):
         return x[2] - 0.5
 
-    refused("shapes", rf"^{name}\(x.* asks for entry 2 of x, whose shape is \(2,\)", **{name: function})
+    refused("shapes", rf"^{name}\(x.* reads entry 2 of x, whose shape is \(2,\)", **{name: function})
 
 
 def test_every_player_and_the_time():
@@ -91,7 +91,7 @@ def test_every_front_door():
         "chain": lambda: hjb.chain.generator(wrong, ALONG, np.zeros((5, 5, 1))),
     }
     for door in doors.values():
-        with pytest.raises(ValueError, match="asks for entry 2 of"):
+        with pytest.raises(ValueError, match="reads entry 2 of"):
             door()
 
 

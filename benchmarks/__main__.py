@@ -15,6 +15,7 @@ NAMES = {
     "estimates": ("accuracy", "the estimated grid error against the true error, over the same problems"),
     "sweep": ("speed", "node-controls per second of one sweep, against numba and the copy bandwidth"),
     "peers": ("speed", "a certified solve against QuantEcon, mdpsolver and a hand-written numba solver"),
+    "eikonal": ("speed", "the eikonal equation against scikit-fmm, at equal nodes and at equal error"),
     "growth": ("speed", "seconds, steps and bytes per node of certified solves on finer and finer grids"),
     "scaling": ("speed", "the N^n law: seconds, steps and bytes per node in one to six dimensions"),
     "controls": ("speed", "seconds against the number of controls and against the error, compared with O(1/ε^{2n+m})"),

@@ -21,6 +21,11 @@ def pendulum(nodes: int, actions: int | None = 21, mass: float = 1.0) -> tuple[h
     return problem, grid
 
 
+def undiscounted_pendulum(nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
+    """The zoo's pendulum without a discount, brought to rest at the top; nodes x (nodes + 1)."""
+    return hjb.zoo.pendulum(shape=(nodes, nodes + 1))
+
+
 def dubins(nodes: int, discount: float) -> tuple[hjb.Problem, hjb.Grid]:
     """The zoo's car to a disc of radius 0.5, on [−3, 3]² × [−π, π) with (nodes + 1)² · nodes nodes."""
     problem, _ = hjb.zoo.dubins(radius=0.5, discount=discount)

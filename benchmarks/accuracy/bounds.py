@@ -25,7 +25,7 @@ COLUMNS = ("problem", "count", "certified", "refused", "held", "unfinished", "ti
 
 @click.command()
 @click.option(
-    "--problems", default=2000, show_default=True, help="Number of problems, spread evenly over the families."
+    "--problems", default=4000, show_default=True, help="Number of problems, spread evenly over the families."
 )
 @click.option("--family", "names", multiple=True, help="Only these families.")
 @click.option("--quick", is_flag=True, help="Two of each family.")

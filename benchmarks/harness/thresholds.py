@@ -50,6 +50,9 @@ THRESHOLDS = {
     "numba 800": Threshold(HAND.format("800 x 801"), 1.5, 3.5),
     "numba 1600": Threshold(HAND.format("1600 x 1601"), 1.5, 3.5),
     "growth": Threshold("pendulum, seconds at 1600 x 1601 over those at 400 x 401", 24, most=True),
+    "growth undiscounted": Threshold(
+        "pendulum without discount, by default, seconds at 1600 x 1601 over those at 400 x 401", 22, most=True
+    ),
     "dubins bytes": Threshold("Dubins car 101 x 101 x 100, peak", 100, unit=" bytes a node", most=True),
     "dubins exponent": Threshold("Dubins car, exponent of seconds in nodes", 1.2, unit="", most=True),
     "manipulator bytes": Threshold("two-link arm 40 x 40 x 41 x 41, peak", 100, unit=" bytes a node", most=True),

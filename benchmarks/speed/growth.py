@@ -36,7 +36,7 @@ FITTED = 10_000
 class Case:
     """A family of cases by one number, its sizes, its quick sizes, and the tolerance.
 
-    ``repeats`` is the number of warm solves of each size.
+    ``repeats`` is the number of warm solves of each size; with ``first_order`` they use ``Upwind()``, not the default.
     """
 
     name: str
@@ -45,10 +45,21 @@ class Case:
     quick: tuple[int, ...]
     tol: float
     repeats: int = 3
+    first_order: bool = True
 
 
+PLANE, QUICK = (100, 200, 400, 800, 1600), (16, 32)
+ALIKE: dict[str, Any] = {
+    "build": cases.undiscounted_pendulum,
+    "sizes": PLANE,
+    "quick": QUICK,
+    "tol": 1e-3,
+    "repeats": 5,
+}
 CASES = (
-    Case("pendulum", cases.pendulum, (100, 200, 400, 800, 1600), (16, 32), 1e-3, repeats=9),
+    Case("pendulum", cases.pendulum, PLANE, QUICK, 1e-3, repeats=9),
+    Case("pendulum undiscounted", **ALIKE),
+    Case("pendulum undiscounted, default", **ALIKE, first_order=False),
     Case("dubins", lambda n: cases.dubins(n, 1.0), (24, 50, 100), (10, 12), 1e-3),
     Case("dubins undiscounted", lambda n: cases.dubins(n, 0.0), (24, 50, 100), (10, 12), 1e-3),
     Case("manipulator", cases.manipulator, (14, 20, 28, 40), (4, 6), 1e-2),
@@ -69,9 +80,10 @@ def first(case: Case, size: int, time_limit: float | None) -> dict[str, Any]:
 def solve(case: Case, size: int, time_limit: float | None) -> hjb.Solution:
     """The answer, whatever its status."""
     problem, grid = case.build(size)
+    scheme = hjb.Upwind() if case.first_order else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", hjb.SolveWarning)  # nodes that cannot reach the target
-        return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False, scheme=hjb.Upwind())
+        return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False, scheme=scheme)
 
 
 def in_turns(case: Case, rows: list[dict[str, Any]], repeats: int, time_limit: float | None) -> list[dict[str, Any]]:
@@ -98,9 +110,10 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
     """The figures with a threshold that these rows contain."""
     found = {(row["problem"], row["shape"][0]): row for row in rows if row["status"] == "CONVERGED"}
     figures = {}
-    if {("pendulum", 400), ("pendulum", 1600)} <= set(found):
-        rounds = zip(*(found["pendulum", size]["rounds"] for size in (1600, 400)), strict=True)
-        figures["growth"] = median(large / small for large, small in rounds)
+    for key, name in (("growth", "pendulum"), ("growth undiscounted", "pendulum undiscounted, default")):
+        if {(name, 400), (name, 1600)} <= set(found):
+            rounds = zip(*(found[name, size]["rounds"] for size in (1600, 400)), strict=True)
+            figures[key] = median(large / small for large, small in rounds)
     for key, name, size in (("dubins", "dubins", 101), ("manipulator", "manipulator", 40)):
         if (name, size) in found:
             row = found[name, size]

@@ -23,6 +23,7 @@ from benchmarks.speed import (
     batch,
     controls,
     devices,
+    eikonal,
     gradients,
     growth,
     information,
@@ -221,6 +222,24 @@ def test_growth_is_the_median_of_the_rounds():
     ]
     assert growth.judged(rows) == {"growth": 20.0}
     assert growth.judged([rows[0], rows[1] | {"status": "STALLED"}]) == {}
+
+
+def test_the_seconds_of_the_peer_for_an_error_lie_on_a_power_law():
+    """Second order in the plane: a quarter of the error takes four times the nodes, and here four times the seconds."""
+    peers = [{"error": 0.4 / k**2, "seconds": 0.1 * k**2} for k in (1, 2, 4)]
+    for error, seconds, beyond in ((0.2, 0.2, False), (0.05, 0.8, False), (0.0125, 3.2, True), (0.8, 0.1, False)):
+        found = eikonal.seconds_for(error, peers)
+        assert found == (pytest.approx(seconds), beyond)
+
+
+@pytest.mark.slow
+def test_the_eikonal_equation_has_one_solution(tmp_path):
+    pytest.importorskip("skfmm")
+    rows = rows_of(eikonal, tmp_path)
+    for dim in (2, 3):
+        finest = max(row["nodes"] for row in rows if row["dim"] == dim)
+        ours, chain, peer = (row["error"] for row in rows if row["dim"] == dim and row["nodes"] == finest)
+        assert ours < peer < chain < 1
 
 
 def test_the_value_of_states_apart_is_a_sum():

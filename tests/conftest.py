@@ -14,13 +14,15 @@ os.environ["MPLBACKEND"] = "Agg"  # for this process and for the commands and no
 os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # or commands find in a user's folder what others compiled
 
 # Traced programs are millions of objects that stay: looking through them again and again finds nothing.
-gc.set_threshold(100_000, 20, 20)
+gc.set_threshold(1_000_000, 50, 1000)
 
 # The first example of a law compiles what the others reuse, so a deadline would time the compiler.
 settings.register_profile("hjbjax", deadline=None, print_blob=True)
 settings.load_profile("hjbjax")
 
-MAPS = 32_000  # of the 65 530 that Linux allows a process; every compiled kernel takes a few, and XLA crashes beyond
+# Compiled kernels take memory maps, of which Linux allows a process 65,530; XLA crashes beyond that. They also take
+# memory, some 6 GB for 20,000 of them.
+MAPS = 60_000 // max(2, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 
 
 # Two thirds of a run are spent in XLA. Without its optimiser it takes half of the time, and jaxlib 0.10 takes half of

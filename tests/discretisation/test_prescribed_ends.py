@@ -42,7 +42,7 @@ def test_exponential_value_with_noise(kind, drift):
     assert errors[-1] < 2e-3 * scale
 
 
-@pytest.mark.parametrize("kind", ["dirichlet", "neumann", "robin"])
+@pytest.mark.parametrize("kind", ["dirichlet", "neumann", pytest.param("robin", marks=pytest.mark.slow)])
 def test_transport_out_of_the_box(kind):
     """Without noise the drift carries the state out at the upper end; what is prescribed there decides V."""
     problem, exact, scale = exponential(0.3, 0.0, 0.5)
@@ -63,6 +63,7 @@ def test_stretched_axes():
     np.testing.assert_allclose(hjb.solve(problem, grid).value, exact(np.asarray(grid.axis(0))), rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_functions_of_the_state_in_the_plane():
     """V = sin(x) exp(y) + y² for a controlled problem whose cost is made from it; functions prescribe its slopes."""
     beta, noise = 0.7, 0.5

@@ -206,7 +206,8 @@ def test_records_of_any_size_leave_no_mass_behind(size):
     "ignore:.*at an end of the box", "ignore:.*narrower than a cell", "ignore:.*dt = .* is longer"
 )
 @pytest.mark.parametrize(
-    ("n", "kind"), [(2, "matrix"), pytest.param(3, "diagonal", marks=pytest.mark.slow), (2, "none")]
+    ("n", "kind"),
+    [*(pytest.param(*case, marks=pytest.mark.slow) for case in [(2, "matrix"), (3, "diagonal")]), (2, "none")],
 )
 @given(seed=SEEDS)
 @settings(max_examples=6)

@@ -142,7 +142,7 @@ def test_shared_inputs_are_optimal(m, kind, noisy):
             assert best[index] >= node.minimum(admissible) - 1e-5  # what SLSQP leaves
 
 
-@pytest.mark.parametrize("kind", ["box", "ball"])
+@pytest.mark.parametrize("kind", [pytest.param("box", marks=pytest.mark.slow), "ball"])
 def test_single_precision_is_as_good_as_its_rounding(kind):
     numbers, value, sigma = drawn(0, 3)
     problem = problem_of(numbers, admissible_set(kind, 3), sigma)
@@ -152,7 +152,8 @@ def test_single_precision_is_as_good_as_its_rounding(kind):
     np.testing.assert_allclose(single, double, atol=1e-5 * np.max(np.abs(double)))
 
 
-@pytest.mark.parametrize("kind", ["box", pytest.param("ball", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["box", "ball"])
 def test_derivatives_of_the_optimum(kind):
     """Of H by every number of the problem, and of the action by one: against differences."""
     numbers, value, sigma = drawn(2, 3)

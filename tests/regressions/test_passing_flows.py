@@ -181,6 +181,7 @@ def test_the_message_tells_never_from_perhaps():
         hjb.solve(onwards, hjb.Grid([-1.0], [1.0], (26,)))
 
 
+@pytest.mark.slow
 def test_arcs_that_do_not_fit_leave_the_chain(monkeypatch):
     """The answer is then that of the chain, with its warning."""
     monkeypatch.setattr(semi_lagrangian, "estimate", lambda *_: 10**15)
@@ -196,6 +197,7 @@ def in_the_way(x):
     return jnp.hypot(x[0] + 0.5, x[1] + 0.15) - 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach the target")
 def test_a_flow_has_its_own_times():
     """The same in a batch of one and inside ``jit``."""

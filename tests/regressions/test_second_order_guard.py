@@ -12,8 +12,11 @@ from hjbjax.solvers import host_solve
 
 HANGING = [np.pi - 1e-9, 0.0]
 # torque, nodes, V(hanging); the monotone scheme on 1600 x 1601 nodes gives 43.4 for the torque 2, and falls
-SWINGS = [(2.0, (60, 61), 47.25), (2.0, (100, 101), 42.69), (3.0, (60, 61), 35.08)]
-MORE = [(2.0, (200, 201), 42.73), (1.5, (60, 61), 67.6), (2.5, (100, 101), 37.62), (3.0, (200, 201), 34.88)]
+SWINGS = [(2.0, (60, 61), 47.25)]
+MORE = [
+    (2.0, (100, 101), 42.69), (3.0, (60, 61), 35.08), (2.0, (200, 201), 42.73), (1.5, (60, 61), 67.6),
+    (2.5, (100, 101), 37.62), (3.0, (200, 201), 34.88),
+]  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
@@ -56,6 +59,7 @@ def test_an_answer_that_contradicts_the_certified_one_is_not_returned(monkeypatc
     np.testing.assert_allclose(solution.value, monotone.value, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_iteration_stops_by_the_distance_to_its_limit():
     """Steps contract by 0.8 and less: the last one was at most tol, and V off by twice that."""
 

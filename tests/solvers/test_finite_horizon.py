@@ -61,6 +61,7 @@ def test_riccati_in_time_has_the_order_of_its_stages():
         assert errors[-1] < {1: 1e-2, 2: 1e-5, 3: 1e-7}[order]
 
 
+@pytest.mark.slow
 def test_four_stages_take_steps_twice_as_long():
     steps = [
         hjb.march(LQ, line(41), 1.0, method=hjb.Explicit(stages), scheme=hjb.Upwind(split=True)).steps

@@ -179,7 +179,15 @@ def _one_player(chain, value, u, lost, eps):
     return _answer(chain, value, u, None, ended, eps)
 
 
+class BeyondDoubles(ArithmeticError):
+    """V is so large that its rounding exceeds what a jump of the chain costs: no policy is better in doubles."""
+
+
 def _answer(chain, value, u, d, ended, eps):
+    size = np.max(np.abs(value[np.isfinite(value)]), initial=0)
+    fastest = max(np.max(rate) for rate in chain.rates(chain.drift(u, d)))
+    if EPS * size * fastest > np.max(np.abs(chain.cost(u, d)), initial=0):
+        raise BeyondDoubles(f"V is {size:.3g}")
     going = 16 * (_noise(chain, value, u, d, eps) + _cancelled(chain, value, u, d, eps))
     noise = np.where(ended, 4 * eps * np.where(np.isfinite(value), np.abs(value), 0), going)
     rounding = _evaluate(chain, u, d, ended, noise, source=noise)

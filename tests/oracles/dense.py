@@ -150,6 +150,10 @@ def _cancelled(chain, value, u, d, eps):
     for way in (drift, -drift):
         for lead, rate in zip(chain.leads, chain.rates(way), strict=True):
             size = size + rate * np.abs(finite[lead] - finite)
+    for i in range(chain.n if model.a is not None else 0):  # what correlation leaves of the noise along an axis
+        taken = sum(np.abs(model.a[:, i, j]) * chain.mean[i] / chain.mean[j] for j in range(chain.n))  # with a_ii
+        for lead in chain.leads[2 * i : 2 * i + 2]:
+            size = size + taken / chain.mean[i] ** 2 * np.abs(finite[lead] - finite)
     return eps * size
 
 
@@ -179,22 +183,16 @@ def _one_player(chain, value, u, lost, eps):
     return _answer(chain, value, u, None, ended, eps)
 
 
-class BeyondDoubles(ArithmeticError):
-    """V is so large that its rounding exceeds what a jump of the chain costs: no policy is better in doubles."""
-
-
 def _answer(chain, value, u, d, ended, eps):
-    size = np.max(np.abs(value[np.isfinite(value)]), initial=0)
-    fastest = max(np.max(rate) for rate in chain.rates(chain.drift(u, d)))
-    if EPS * size * fastest > np.max(np.abs(chain.cost(u, d)), initial=0):
-        raise BeyondDoubles(f"V is {size:.3g}")
     going = 16 * (_noise(chain, value, u, d, eps) + _cancelled(chain, value, u, d, eps))
     noise = np.where(ended, 4 * eps * np.where(np.isfinite(value), np.abs(value), 0), going)
     rounding = _evaluate(chain, u, d, ended, noise, source=noise)
     best, *played = optimum(chain, value)
     with np.errstate(invalid="ignore"):
         left = np.where(ended | np.isinf(value), 0, best - chain.model.discount * value)
-    allowed = 100 * np.maximum(_noise(chain, value, *played, EPS), _noise(chain, value, u, d, EPS))
+    # a rate of 1e-11 is what cancellation leaves of drift or noise: next to a value of 1e16 its last bits count
+    each = [_noise(chain, value, *pair, EPS) + _cancelled(chain, value, *pair, EPS) for pair in (played, (u, d))]
+    allowed = 100 * np.maximum(*each)
     assert np.all(np.abs(left) <= allowed), "the oracle has not solved its equation"
     return Answer(value, np.abs(rounding), float(np.max(np.abs(left))), u, d)
 

@@ -114,7 +114,7 @@ def test_of_two_commands_one_keeps_its_results(tmp_path):
             for name in made:
                 (folder / name).write_text(text)
         run_folder.publish(theirs, out, made)
-        with pytest.raises(FileExistsError, match="holds solution.npz, value.png already"):
+        with pytest.raises(FileExistsError, match="contains solution.npz, value.png already"):
             run_folder.publish(mine, out, made)
         out_again = tmp_path / "again"  # taken between the check and the move
         out_again.mkdir()

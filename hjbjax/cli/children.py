@@ -137,7 +137,7 @@ def run(
       patience: seconds for which a child may stay stopped.
       farewell: text on standard output by which a child other than the first reports that the others no longer need it;
         if empty, exit code 0 means this.
-      arrival: text on standard output by which a child reports that it has started, and the seconds that it has for that.
+      arrival: text on standard output by which a child reports that it has started, and the seconds allowed for that.
 
     Raises:
       OSError: a child could not be started; no child is left running.

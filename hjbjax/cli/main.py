@@ -118,6 +118,9 @@ def solve(
         _estimate(*_build(entry, parameters, shape), options, as_json=as_json)
         processes_of.leave()
         return
+    out = Path(name) if out is None else out
+    if processes_of.rank() == 0:  # before the processes meet: one that fails afterwards waits for the others to part
+        _check_places(out, force, options["checkpoint"], options["resume"])
     options["mesh"] = processes_of.mesh_of(devices)
     check_jax()
     if processes_of.rank() > 0:  # only the first process of a launch writes files and prints
@@ -125,9 +128,6 @@ def solve(
             _solve(*_build(entry, parameters, shape), options)
             processes_of.leave()
         return
-    out = Path(name) if out is None else out
-    # check arguments and places first, because they cost least, then the problem, then solve
-    _check_places(out, force, options["checkpoint"], options["resume"])
     problem, grid = _build(entry, parameters, shape)
     with contextlib.ExitStack() as stack:  # removes the hidden folder at the end, even after an interrupt
         stack.enter_context(interrupts.raised())

@@ -83,6 +83,18 @@ def test_a_pipe_that_nobody_reads_ends_the_command_quietly(words):
     assert (done.returncode, done.stderr) == (141, "")
 
 
+def test_a_process_that_fails_does_not_wait_for_the_others_of_its_launch():
+    """JAX parts from them at a normal exit: half a minute, after which another process was named."""
+    code = """
+import atexit, sys, types
+sys.modules["jax"] = types.SimpleNamespace(distributed=types.SimpleNamespace(is_initialized=lambda: True))
+atexit.register(print, "a normal exit")
+"""
+    done = process("no-such-command", code=code)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("hjbjax: No such command")
+
+
 @posix
 def test_closed_descriptors_are_not_given_to_files():
     """Otherwise the next file that the command opens would receive what XLA writes to standard error."""

@@ -217,6 +217,15 @@ def test_a_process_that_is_not_needed_any_more_says_so(number, words, monkeypatc
     assert capsys.readouterr().out == words
 
 
+def test_the_first_process_checks_its_places_before_it_meets_the_others(tmp_path, monkeypatch):
+    """Another launch may have made the checkpoint meanwhile; the others would wait in the middle of the solve."""
+    as_member(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(launch, "mesh_of", None)
+    (tmp_path / "run.npz").touch()
+    refused(("solve", "pendulum", "--checkpoint", "run"), "run.npz already exists")
+
+
 @pytest.mark.parametrize("number", [None, "0", "1"])
 def test_a_process_of_a_launch_reports_that_it_has_begun(number, monkeypatch, capsys):
     if number is not None:

@@ -9,6 +9,7 @@ interrupt the launcher between the start of a child and the record of it:
     the first child ends                 the same, because its result counts
     another one ends without a farewell  ask the others to end
     a child stays stopped                ask all of them to end, and continue it
+    a child does not report its start    ask all of them to end
     ``GRACE`` seconds after any of them  kill the children that still run
 
 A request to end is SIGTERM, and also SIGCONT for a stopped child. A launcher that is killed cannot send it, but
@@ -79,6 +80,7 @@ class Outcome:
       interrupted: True if a signal came before any child failed.
       hurried: True if a second signal killed the children.
       stopped: numbers of the children that were stopped (SIGSTOP) when they were asked to end.
+      late: numbers of the children that did not report their start in time.
       killed: numbers of the children that were killed.
       unwritten: the error that prevented output of the first child from being passed on.
     """
@@ -87,6 +89,7 @@ class Outcome:
     interrupted: bool = False
     hurried: bool = False
     stopped: tuple[int, ...] = ()
+    late: tuple[int, ...] = ()
     killed: tuple[int, ...] = ()
     unwritten: OSError | None = None
 
@@ -102,10 +105,10 @@ class Outcome:
         """
         alone = [end for end in self.ends if end.number not in self.killed]
         crashed = [end for end in alone if end.code < 0 and -end.code not in SHARED]
-        stopped = [self.end_of(number) for number in self.stopped]
+        silent = [self.end_of(number) for number in (*self.stopped, *self.late)]
         early = [end for end in self.ends if end.early]
         failed = [end for end in self.ends if end.code != 0]
-        return next(iter([*crashed, *early, *stopped, *failed]), None)
+        return next(iter([*crashed, *early, *silent, *failed]), None)
 
 
 def followed(module: str, words: Sequence[str], environment: Mapping[str, str]) -> Command:
@@ -123,6 +126,7 @@ def run(
     muted: Collection[bytes] = (),
     patience: float = math.inf,
     farewell: bytes = b"",
+    arrival: tuple[bytes, float] = (b"", math.inf),
 ) -> Outcome:
     """Run commands in parallel until all of them have ended; pass on the output of the first one.
 
@@ -133,11 +137,12 @@ def run(
       patience: seconds for which a child may stay stopped.
       farewell: text on standard output by which a child other than the first reports that the others no longer need it;
         if empty, exit code 0 means this.
+      arrival: text on standard output by which a child reports that it has started, and the seconds allowed for that.
 
     Raises:
       OSError: a child could not be started; no child is left running.
     """
-    launcher = _Launcher(explained, muted, patience, farewell)
+    launcher = _Launcher(explained, muted, patience, farewell, arrival)
     with _signals_into(launcher.events):
         try:
             for command in commands:
@@ -151,8 +156,17 @@ def run(
 class _Launcher:
     """The running children, the ends of the others, and the time of the next request."""
 
-    def __init__(self, explained: Collection[int], muted: Collection[bytes], patience: float, farewell: bytes):
+    def __init__(
+        self,
+        explained: Collection[int],
+        muted: Collection[bytes],
+        patience: float,
+        farewell: bytes,
+        arrival: tuple[bytes, float],
+    ):
         self.explained, self.muted, self.patience, self.farewell = explained, muted, patience, farewell
+        self.greeting, seconds = arrival
+        self.late_at, self.arrived = time.monotonic() + seconds, set[int]()
         self.events: queue.SimpleQueue[End | int] = queue.SimpleQueue()
         self.running: dict[int, subprocess.Popen] = {}
         self.voices: list[threading.Thread] = []
@@ -162,6 +176,7 @@ class _Launcher:
         self.interrupted = self.hurried = False
         self.standing: dict[int, float] = {}  # the seconds for which a child has been stopped
         self.stopped: tuple[int, ...] = ()
+        self.late: tuple[int, ...] = ()
         self.killed: tuple[int, ...] = ()
         self.quiet = threading.Event()  # if set, the first child's output only concerns the missing others
         self.unwritten: list[OSError] = []
@@ -181,8 +196,8 @@ class _Launcher:
         noted: collections.deque[bytes] = collections.deque(maxlen=1)
         said: collections.deque[bytes] = collections.deque(maxlen=LINES)
         voices = (
-            self._listen(process.stderr, sys.stderr if first else None, noted),
-            self._listen(process.stdout, sys.stdout if first else None, said),
+            self._listen(number, process.stderr, sys.stderr if first else None, noted),
+            self._listen(number, process.stdout, sys.stdout if first else None, said),
         )
 
         def report_end() -> None:
@@ -195,14 +210,19 @@ class _Launcher:
 
         threading.Thread(target=report_end, daemon=True).start()
 
-    def _listen(self, stream: IO[bytes] | None, out: Any, last: collections.deque[bytes]) -> threading.Thread:
-        """Start a thread that reads the output of a child, keeps the last lines and passes all lines on."""
+    def _listen(
+        self, number: int, stream: IO[bytes] | None, out: Any, last: collections.deque[bytes]
+    ) -> threading.Thread:
+        """Start a thread that reads the output of a child, keeps the last lines and passes on all but the greeting."""
 
         def listen() -> None:
             assert stream is not None
             sink = out
             with stream:
                 for line in stream:
+                    if self.greeting and self.greeting in line:
+                        self.arrived.add(number)
+                        continue
                     if line.strip():
                         last.append(line)
                     if sink is None or self.quiet.is_set() or any(part in line for part in self.muted):
@@ -226,6 +246,7 @@ class _Launcher:
                 event = self.events.get(timeout=min(TICK, max(0.0, left)))
             except queue.Empty:
                 self._note_stopped()
+                self._note_late()
             else:
                 if isinstance(event, End):
                     self._note_end(event)
@@ -263,6 +284,14 @@ class _Launcher:
         if self.asked_at is None and any(seconds > self.patience for seconds in self.standing.values()):
             self.ask_at = min(self.ask_at, time.monotonic())
             self.kill_at = min(self.kill_at, self.ask_at + GRACE)
+
+    def _note_late(self) -> None:
+        """Ask the children to end if one of them has not reported its start in time: the others wait for it."""
+        if self.asked_at is None and time.monotonic() > self.late_at:
+            self.late_at, self.late = math.inf, tuple(each for each in self.running if each not in self.arrived)
+            if self.late:
+                self.ask_at = min(self.ask_at, time.monotonic())
+                self.kill_at = min(self.kill_at, self.ask_at + GRACE)
 
     def _stopped_now(self) -> tuple[int, ...]:
         """The numbers of the children that are stopped."""
@@ -304,8 +333,15 @@ class _Launcher:
 
     def outcome(self) -> Outcome:
         """The ends of all children."""
-        unwritten = next(iter(self.unwritten), None)
-        return Outcome(tuple(self.ends), self.interrupted, self.hurried, self.stopped, self.killed, unwritten)
+        return Outcome(
+            ends=tuple(self.ends),
+            interrupted=self.interrupted,
+            hurried=self.hurried,
+            stopped=self.stopped,
+            late=self.late,
+            killed=self.killed,
+            unwritten=next(iter(self.unwritten), None),
+        )
 
 
 def _write(line: bytes, out: Any) -> None:

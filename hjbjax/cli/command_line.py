@@ -69,12 +69,24 @@ class OneLineGroup(click.Group):
             code = 5
             streams.let_go(sys.stdout)
             say(f"the output could not be written: {error.strerror or error}")
-        if code == interrupts.CODE and sys.stdout is sys.__stdout__:  # not inside a test or another program
+        code = code if isinstance(code, int) else 0  # a command that ends well returns None
+        if (code == interrupts.CODE or _is_joined()) and sys.stdout is sys.__stdout__:  # not inside another program
             # os._exit does not flush
             for stream in (sys.stdout, sys.stderr):
                 streams.Expendable(stream).flush()
             os._exit(code)  # JAX may still be at work, and a normal exit would wait for it or crash
-        sys.exit(code if isinstance(code, int) else 0)  # a command that ends well returns None
+        sys.exit(code)
+
+
+def _is_joined() -> bool:
+    """True in a process of a launch that has failed before it parted from the others; they would hold up its end."""
+    if "jax" not in sys.modules:
+        return False
+    try:
+        from jax import distributed
+    except ImportError:  # JAX could not start
+        return False
+    return distributed.is_initialized()
 
 
 class _Unread(click.ClickException):

@@ -1,6 +1,7 @@
 """Compiled programs on disk, shared between processes through JAX's persistent compilation cache."""
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -8,6 +9,8 @@ SETTINGS = {  # JAX's defaults skip programs that compile in less than a second,
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
+DIRECTORY = "jax_compilation_cache_dir"
+FAULT = re.compile(r"Error (read|writ)ing persistent compilation cache entry for '.*?': (.*)")  # JAX's warning
 CHOICES = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # if one is set, the user has decided
 
 
@@ -49,7 +52,7 @@ def keep_compiled(folder: str | os.PathLike | None = None) -> Path:
         raise PermissionError(f"keep_compiled: {place} cannot be written")
     for name, value in SETTINGS.items():
         jax.config.update(name, value)
-    jax.config.update("jax_compilation_cache_dir", str(place))
+    jax.config.update(DIRECTORY, str(place))
     return place
 
 
@@ -61,3 +64,18 @@ def keep_for_the_command() -> None:
         keep_compiled()
     except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return
+
+
+def fault_in(warning: str) -> tuple[str | None, str]:
+    """The kind of cache fault that a warning of JAX reports, and a line for the user.
+
+    For other warnings the kind is None, and the line is the warning itself.
+    """
+    found = FAULT.fullmatch(warning)
+    if found is None:
+        return None, warning
+    from jax import config
+
+    fault = f"cannot be {'read' if found[1] == 'read' else 'written'}"
+    folder = getattr(config, DIRECTORY)
+    return fault, f"compiled programs in {folder} {fault}: {found[2]}; remove that folder, or give --no-cache"

@@ -35,6 +35,8 @@ MOST = 256  # maximal number of processes per launch and of devices per process,
 LONGEST = 86_400  # seconds of a heartbeat
 _ADVICE = "'hjbjax launch' sets these variables; unset all of them to solve in one process"
 WITHOUT_PROXY = {"no_grpc_proxy": "127.0.0.1"}  # otherwise gRPC uses a proxy even for processes of this host
+ARRIVED = "hjbjax: arrived"  # printed by a process that has imported everything
+ARRIVAL = 120.0  # seconds for the imports; one more per process, because the imports share the processors
 FAREWELL = "hjbjax: parted"  # printed by a process that the others no longer need
 GREETING = (b"[Gloo]", b"connected peer ranks")  # in messages of gloo, which several threads may mix in one line
 
@@ -137,6 +139,19 @@ def mesh_of(counts: tuple[int, ...] | None) -> "Mesh | None":
     return Mesh(np.array(devices[:wanted]).reshape(counts), tuple(f"axis{k}" for k in range(len(counts))))
 
 
+def arrive() -> None:
+    """Report the start of this process to its launcher, if there is one; otherwise JAX blames the one that waits."""
+    if member() is not None:
+        _report(ARRIVED)
+
+
+def _report(words: str) -> None:
+    """Write a line that the launcher reads."""
+    out = streams.Expendable(sys.stdout)
+    out.write(f"{words}\n")
+    out.flush()
+
+
 def _join(this: Member) -> None:
     """Meet the other processes of a launch."""
     import jax
@@ -179,9 +194,7 @@ def leave() -> None:
 
     jax.distributed.shutdown()
     if this.rank > 0:  # the first process continues and prints for all
-        out = streams.Expendable(sys.stdout)
-        out.write(f"{FAREWELL}\n")
-        out.flush()
+        _report(FAREWELL)
 
 
 # --- in the launcher ---
@@ -228,8 +241,9 @@ def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) ->
                 children.followed("hjbjax", words, {**os.environ, **shared, RANK: str(number)})
                 for number in range(processes)
             ]
+            arrival = (ARRIVED.encode(), ARRIVAL + processes)
             # less than the heartbeat, so that the others can save their work even if the stopped one continues
-            outcome = children.run(commands, EXPLAINED, GREETING, heartbeat / 2, FAREWELL.encode())
+            outcome = children.run(commands, EXPLAINED, GREETING, heartbeat / 2, FAREWELL.encode(), arrival)
     except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
         raise Failure(f"launch: {processes} processes could not be started: {error}", DIED) from error
     code = _verdict(outcome, _way_on(words, processes, result))
@@ -258,6 +272,8 @@ def _verdict(outcome: children.Outcome, way_on: str) -> int:
         raise Failure(f"{name} ended with exit code 0 before the others were done; {way_on}", DIED)
     if culprit.number in outcome.stopped:
         raise Failure(f"{name} was stopped, and the others cannot go on without it; {way_on}", DIED)
+    if culprit.number in outcome.late:
+        raise Failure(f"{name} did not start within {ARRIVAL + processes:.0f} s; {way_on}", DIED)
     if culprit.code < 0:
         names = {each.value: f" ({each.name})" for each in signal.Signals}  # real-time signals have none
         by = f"signal {-culprit.code}{names.get(-culprit.code, '')}"

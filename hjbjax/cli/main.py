@@ -111,12 +111,16 @@ def solve(
     entry = catalogue()[name]
     from hjbjax.cli import compile_cache, run_folder
 
+    processes_of.arrive()
     parameters = parameters_of(entry, settings)
     if dry_run:
         check_jax()
         _estimate(*_build(entry, parameters, shape), options, as_json=as_json)
         processes_of.leave()
         return
+    out = Path(name) if out is None else out
+    if processes_of.rank() == 0:  # before the processes meet: one that fails afterwards waits for the others to part
+        _check_places(out, force, options["checkpoint"], options["resume"])
     options["mesh"] = processes_of.mesh_of(devices)
     check_jax()
     if processes_of.rank() > 0:  # only the first process of a launch writes files and prints
@@ -124,9 +128,6 @@ def solve(
             _solve(*_build(entry, parameters, shape), options)
             processes_of.leave()
         return
-    out = Path(name) if out is None else out
-    # check arguments and places first, because they cost least, then the problem, then solve
-    _check_places(out, force, options["checkpoint"], options["resume"])
     problem, grid = _build(entry, parameters, shape)
     with contextlib.ExitStack() as stack:  # removes the hidden folder at the end, even after an interrupt
         stack.enter_context(interrupts.raised())
@@ -210,7 +211,12 @@ def _check_places(out: Path, force: bool, checkpoint: Path | None, resume: bool)
         run_folder.check_folder(out, force)
     if resume and checkpoint is None:
         raise Failure("--resume continues from a checkpoint; add --checkpoint FILE")
-    if checkpoint is None or resume or not os.path.lexists(place := files.with_suffix(os.fspath(checkpoint))):
+    if checkpoint is None:
+        return
+    place = files.with_suffix(os.fspath(checkpoint))
+    if run_folder.takes(out, place):
+        raise Failure(f"--checkpoint: {place} is a name that --out {out} needs; give another one")
+    if resume or not os.path.lexists(place):
         return
     with _one_line_error(FileError, 5, "--checkpoint: "):
         check_place(place, force=True)
@@ -252,7 +258,13 @@ def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | 
 
 @contextlib.contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    """Show warnings as one line each, without the source line that Python adds."""
+    """Show warnings as one line each, without the source line that Python adds.
+
+    JAX repeats a fault of its cache for every program. Only the first of them is shown.
+    """
+    from hjbjax.cli import compile_cache
+
+    faults: set[str] = set()
 
     def show(
         message: Warning | str,
@@ -262,7 +274,11 @@ def _one_line_warnings() -> Iterator[None]:
         file: TextIO | None = None,
         line: str | None = None,
     ) -> None:
-        say(f"warning: {' '.join(str(message).split())}")
+        fault, said = compile_cache.fault_in(" ".join(str(message).split()))
+        if fault not in faults:
+            say(f"warning: {said}")
+        if fault is not None:
+            faults.add(fault)
 
     with warnings.catch_warnings():
         # always, because by default a warning is shown once per line of code, and PYTHONWARNINGS may change that
@@ -352,10 +368,12 @@ def _write(
             run_folder.publish(staging, out, made, force)
             published = bool(made)
     except OSError as error:
-        message = f"the results could not be written: {error}"
-        if not published:
-            message += "; " + run_folder.rescue(out, lambda folder: run_folder.copy(solution, staging, folder))
-        raise Failure(message, 5) from error
+        # the hidden folder is gone by the time that anybody reads this
+        reason = str(error).replace(f"{staging}{os.sep}", f"{out}{os.sep}")
+        if published:
+            raise Failure(f"{reason}; written: {', '.join(text_of(out / file) for file in made)}", 5) from error
+        kept = run_folder.rescue(out, lambda folder: run_folder.copy(solution, staging, folder))
+        raise Failure(f"the results could not be written: {reason}; {kept}", 5) from error
     return [out / file for file in made], path
 
 

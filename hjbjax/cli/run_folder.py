@@ -29,7 +29,7 @@ from hjbjax.feedback.path import joined
 from hjbjax.feedback.simulation import simulate
 from hjbjax.plotting.maps import closed_loop_size
 from hjbjax.plotting.slices import at_states
-from hjbjax.plotting.style import NARROW
+from hjbjax.plotting.style import NARROW, save_figure
 from hjbjax.problem import streams
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball
@@ -65,6 +65,13 @@ def check_folder(out: Path, force: bool = False) -> None:
         raise FileExistsError(f"{out} contains {', '.join(old)} already; give another --out, or --force to replace")
 
 
+def takes(out: Path, file: str) -> bool:
+    """True if the results in the folder ``out`` need the name of a file for one of them or for a parent folder."""
+    whole, place = Path(placement.absolute(os.fspath(out))), Path(placement.absolute(file))
+    # an existing folder is refused for that reason
+    return not place.is_dir() and place in (whole, *whole.parents, *(whole / name for name in FILES))
+
+
 @contextlib.contextmanager
 def staging(out: Path) -> Iterator[Path]:
     """Create a hidden folder on the file system of ``out``, to check that it can be written; remove it at the end.
@@ -82,6 +89,9 @@ def staging(out: Path) -> Iterator[Path]:
     try:
         try:
             folder.mkdir(mode=0o700)  # private until it is complete
+            trial = folder / FILES[0]
+            trial.write_bytes(bytes(placement.BLOCK))  # a full disk may still accept folders
+            trial.unlink()
             missing = whole.relative_to(place).parts
             folder.joinpath(*missing).mkdir(parents=True, exist_ok=True)  # detects names that are too long now
         except OSError as error:
@@ -136,9 +146,13 @@ def rescue(out: Path, fill: Callable[[Path], object]) -> str:
       out: the folder that could not be written.
       fill: a function that writes the results into a folder.
     """
-    for parent in (lambda: placement.absolute(os.fspath(out.parent)), tempfile.gettempdir):
+
+    def beside() -> str:
+        return os.path.dirname(placement.absolute(os.fspath(out)))
+
+    for parent in (beside, tempfile.gettempdir):
         with contextlib.suppress(OSError):
-            folder = Path(tempfile.mkdtemp(prefix=f"{out.name[:NAME]}-", dir=parent()))
+            folder = Path(tempfile.mkdtemp(prefix=f"{out.name[:NAME] or 'hjbjax'}-", dir=parent()))
             try:
                 fill(folder)
             except OSError:
@@ -177,7 +191,7 @@ def make(
     with_curve(value, solution, fixed, jumps).save(folder / "value.png", dpi=DPI)
     yield "value.png", None
     if problem.controls is not None:
-        policies(solution, fixed, jumps).savefig(folder / "policy.png", dpi=DPI)
+        save_figure(policies(solution, fixed, jumps), folder / "policy.png", dpi=DPI)
         yield "policy.png", None
     path = None
     if solution.status == Status.CONVERGED:  # a closed loop with an unfinished feedback would be misleading

@@ -7,7 +7,6 @@ state above it belongs to the set, so the value is minimised over the removed ax
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
@@ -32,6 +31,7 @@ from hjbjax.plotting.surfaces import level_surface, lit, thinned
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import SIDES, Labels
 from hjbjax.problem.pytree import keywords, refuse_misspelt
+from hjbjax.solution.files import Path, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -189,9 +189,14 @@ class Scene:
 
     figure: Any
 
-    def save(self, path: str | os.PathLike) -> None:
-        """Write a self-contained page of about 5 MB, most of it plotly itself."""
-        self.figure.write_html(os.fspath(path), include_plotlyjs=True)
+    def save(self, path: Path) -> None:
+        """Write a self-contained page of about 5 MB, most of it plotly itself, whole or not at all.
+
+        Raises:
+          FileError: the file cannot be written; an older file is left as it is.
+        """
+        page = self.figure.to_html(include_plotlyjs=True).encode()
+        write_whole(path, lambda stream: stream.write(page), force=True)
 
 
 def _field(solution: Solution, inside: str | None, time: float | None) -> Field:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import functools
 import inspect
+import io
+import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
@@ -14,10 +16,10 @@ import numpy as np
 
 from hjbjax.problem.arguments import shown
 from hjbjax.problem.pytree import front_door
+from hjbjax.solution.files import Path, write_whole
+from hjbjax.solution.placement import path_of
 
 if TYPE_CHECKING:
-    import os
-
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -95,12 +97,33 @@ class Picture(list):
         """The whole figure, even if the axes are on a subfigure."""
         return cast("Figure", self.ax.get_figure(root=True))
 
-    def save(self, path: str | os.PathLike, **options: Any) -> None:
-        """Write the figure to ``path``; the suffix selects the format, and ``options`` go to ``savefig``."""
-        self.figure.savefig(path, **{"dpi": DPI, **options})
+    def save(self, path: Path, **options: Any) -> None:
+        """Write the figure to ``path``, whole or not at all. An older file is replaced.
+
+        Args:
+          path: the file; its suffix selects the format, as in "value.png".
+          options: of matplotlib's ``savefig``.
+
+        Raises:
+          FileError: the file cannot be written; an older file is left as it is.
+          ValueError: matplotlib does not know the format, or cannot write it as one file.
+        """
+        save_figure(self.figure, path, **options)
 
     def __repr__(self) -> str:
         return f"Picture of {len(self)} artists"
+
+
+def save_figure(figure: Figure, path: Path, *, format: str | None = None, **options: Any) -> None:
+    """Write a figure to a file, whole or not at all; see ``Picture.save``."""
+    name = path_of(path, "written")
+    kind = format or os.path.splitext(name)[1][1:]
+    if not kind:
+        kind = figure.canvas.get_default_filetype()
+        name = f"{name.rstrip('.')}.{kind}"
+    picture = io.BytesIO()
+    figure.savefig(picture, format=kind, **{"dpi": DPI, **options})
+    write_whole(name, lambda stream: stream.write(picture.getbuffer()), force=True)
 
 
 def axes_of(ax: Axes | None, *, wide: bool = False) -> Axes:

@@ -47,6 +47,7 @@ ELSEWHERE = {  # names of arguments in other packages and books, and the names u
 }
 # the start of an error message of a function that other public functions call
 INNER = re.compile(r"^(lane \d+: )?(?:solve|solve_batch|march|reach_probability): ")
+INTERRUPT = re.compile(r"\nKeyboardInterrupt\b.*\s*\Z")  # the end of the traceback that XLA makes an error of its own
 REMEMBERED = 256  # the number of most recent answers to keep per function; their keys hold functions and arrays
 
 
@@ -120,7 +121,8 @@ def with_suggestions(function: Callable[P, T], name: str | None = None) -> Calla
 def front_door(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function: sets the package's JAX options and adds ``with_suggestions``.
 
-    If ``solve`` or ``march`` raises inside the function, the message begins with the name of the outer function.
+    If ``solve`` or ``march`` raises inside the function, the message begins with the name of the outer function. Ctrl-C
+    is a ``KeyboardInterrupt`` also if it fell into a call of the host from a compiled program, as under ``grad``.
     """
 
     @functools.wraps(function)
@@ -128,8 +130,10 @@ def front_door(function: Callable[P, T]) -> Callable[P, T]:
         with own_settings():
             try:
                 return function(*arguments, **options)
-            except (ValueError, TypeError) as refusal:
-                _rename(refusal, function.__name__)
+            except (ValueError, TypeError, jax.errors.JaxRuntimeError) as error:
+                if INTERRUPT.search(str(error)):
+                    raise KeyboardInterrupt from error
+                _rename(error, function.__name__)
                 raise
 
     return with_suggestions(entered)

@@ -40,6 +40,8 @@ def own_settings(*, x64: bool | None = None) -> Iterator[None]:
         jax.default_matmul_precision("highest"),
         # without jit every sweep over a grid would be a loop in Python
         jax.disable_jit(False),
+        # callers forbid new traces of their own programs; every solve traces the functions of its problem
+        jax.no_tracing(False),
         contextlib.nullcontext() if x64 is None else jax.enable_x64(x64),
     ):
         yield

@@ -124,8 +124,15 @@ def write_archive(stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[
 
 
 def with_suffix(path: str) -> str:
-    """The name with ``.npz``, as NumPy writes it, unless it has a suffix or a file of that very name exists."""
-    return path if os.path.splitext(path)[1] or os.path.lexists(path) or not path else path + ".npz"
+    """The name with ``.npz``, as NumPy writes it, unless it has a suffix or a file of that very name exists.
+
+    A folder of that name does not count if the file with ``.npz`` exists: ``hjbjax solve pendulum --checkpoint
+    pendulum`` makes both.
+    """
+    if not path or os.path.splitext(path)[1]:
+        return path
+    whole = path + ".npz"
+    return path if os.path.lexists(path) and not (os.path.isdir(path) and os.path.isfile(whole)) else whole
 
 
 def _sync_folder(folder: str) -> None:

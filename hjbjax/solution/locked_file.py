@@ -7,6 +7,7 @@ without locks leaves one check: a file that another run has put there is never r
 
 import contextlib
 import os
+import weakref
 from collections.abc import Callable
 from typing import IO, TypeAlias
 
@@ -15,6 +16,7 @@ from hjbjax.solution.placement import FileError
 
 TRIES = 100  # of opening a file that others replace meanwhile
 Held: TypeAlias = tuple[os.stat_result, int | None]  # which file, and a handle that keeps its lock
+_made: "weakref.WeakSet[LockedFile]" = weakref.WeakSet()
 
 
 class LockedFile:
@@ -27,6 +29,7 @@ class LockedFile:
     def __init__(self, path: str):
         self.path = path
         self._own: list[Held] = []  # the run's file at the path, and during a write the one that will replace it
+        _made.add(self)
 
     def take(self) -> bool:
         """Lock the file at the path; False if there is none.
@@ -110,6 +113,16 @@ class LockedFile:
 def _held(handle: int) -> Held:
     """An open file, with a copy of its handle, which shares its lock; Windows replaces no open file, and gets none."""
     return os.fstat(handle), None if placement.fcntl is None else os.dup(handle)
+
+
+def _close_in_fork() -> None:
+    """Close the copies of all handles: a worker that outlives a killed run would keep the lock of its file."""
+    for each in list(_made):
+        each.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_close_in_fork)
 
 
 def _open(path: str) -> int:

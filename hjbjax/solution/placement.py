@@ -128,7 +128,8 @@ def new_file(path: str) -> Iterator[tuple[str, IO[bytes]]]:
         reason = f"there is no folder {folder}" if missing else error.strerror or error
         raise FileError(f"{path}: cannot be written: {reason}") from error
     finally:
-        if os.path.lexists(temporary):
+        # a disk that became read-only refuses this as well, which must not hide the first error
+        with contextlib.suppress(OSError):
             os.unlink(temporary)
 
 

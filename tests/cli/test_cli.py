@@ -17,6 +17,7 @@ from hjbjax import zoo
 from hjbjax.cli import compile_cache, run_folder
 from hjbjax.cli.main import main
 from hjbjax.feedback.path import Path, PathStatus
+from hjbjax.solution import files, placement
 from hjbjax.solution.solution import Solution, Status, load
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -349,23 +350,23 @@ def test_force_replaces_all_and_takes_stale_files_away(solver, folder):
 @pytest.mark.parametrize("file", run_folder.FILES)
 def test_a_full_disk_leaves_no_half_file(solver, folder, monkeypatch, file):
     """The old files stay whole where the new one cannot be written, and what came out whole before is kept."""
-    from matplotlib.figure import Figure
+    finish = placement.finish
 
-    def full(self, path, *args, **options):
-        with open(path, "wb") as half:
-            half.write(b"half")
-        if os.path.basename(path) == file:
+    def full(stream):
+        finish(stream)
+        if f"{os.sep}.{file}." in stream.name:
             raise OSError(28, "No space left on device")
 
     whole = {}
     (folder / "out").mkdir()
     for name in run_folder.FILES:
         (folder / "out" / name).write_bytes(b"old")
-    monkeypatch.setattr(Figure, "savefig", full)
-    if file == "solution.npz":
-        monkeypatch.setattr(Solution, "save", full)
-    assert refused(run("solve", "bang-bang", "--out", "out", "--force"), 5, "No space left on device")
+    for module in (placement, files):
+        monkeypatch.setattr(module, "finish", full)
     made = run_folder.FILES[: run_folder.FILES.index(file)]
+    written = f"; written: {', '.join(os.path.join('out', name) for name in made)}" if made else "; no other folder"
+    reason = f"{os.path.join('out', file)}: cannot be written: No space left on device{written}"
+    assert refused(run("solve", "bang-bang", "--out", "out", "--force"), 5, reason)
     for name in os.listdir("out"):
         whole[name] = (folder / "out" / name).read_bytes()
     assert all(whole[name] != b"old" for name in made)

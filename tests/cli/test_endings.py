@@ -19,6 +19,7 @@ from click.testing import CliRunner
 import hjbjax
 from hjbjax import zoo
 from hjbjax.cli import compile_cache, doctor, gallery, interrupts, run_folder
+from hjbjax.cli import main as cli
 from hjbjax.cli.gallery import Card
 from hjbjax.cli.main import main
 from hjbjax.solution import placement
@@ -80,6 +81,18 @@ def test_a_pipe_that_nobody_reads_ends_the_command_quietly(words):
     done = process(*words, stdout=writer)
     os.close(writer)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_process_that_fails_does_not_wait_for_the_others_of_its_launch():
+    """JAX parts from them at a normal exit: half a minute, after which another process was named."""
+    code = """
+import atexit, sys, types
+sys.modules["jax"] = types.SimpleNamespace(distributed=types.SimpleNamespace(is_initialized=lambda: True))
+atexit.register(print, "a normal exit")
+"""
+    done = process("no-such-command", code=code)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("hjbjax: No such command")
 
 
 @posix
@@ -292,6 +305,58 @@ def test_nothing_is_left_where_no_folder_can_be_written(folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     assert run_folder.rescue(Path("out"), full) == "no other folder could be written either"
     assert os.listdir() == []
+
+
+@pytest.mark.parametrize(
+    ("out", "checkpoint"),
+    [("out", "out/solution.npz"), ("out", "out/../out/solution"), ("out", "link/value.png"), ("a.npz/out", "a")],
+)
+@pytest.mark.parametrize("more", [["--force"], ["--resume", "--force"]])
+def test_a_checkpoint_in_the_place_of_results_is_refused(quick, folder, monkeypatch, out, checkpoint, more):
+    """Results would replace it, or could not be written after the solve."""
+    monkeypatch.setattr(hjbjax, "solve", None)
+    os.symlink("out", folder / "link")
+    result = run("solve", "smooth", "--out", out, "--checkpoint", checkpoint, *more)
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert f"is a name that --out {out} needs; give another one" in result.stderr
+
+
+def test_a_full_disk_is_found_before_anything_is_solved(quick, folder, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(hjbjax, "solve", None)
+    monkeypatch.setattr(Path, "write_bytes", full)  # a full disk still accepts folders
+    result = run("solve", "smooth", "--out", "out")
+    assert (result.exit_code, result.stderr) == (
+        2,
+        "hjbjax: --out: out cannot be written: No space left on device; give another folder\n",
+    )
+    assert os.listdir() == []
+
+
+def test_results_of_the_current_folder_have_a_name_next_to_it(folder, monkeypatch):
+    (folder / "here").mkdir()
+    monkeypatch.chdir(folder / "here")
+    kept = Path(run_folder.rescue(Path(), lambda new: None).removeprefix("they are in "))
+    assert kept.parent == folder
+    assert kept.name.startswith("hjbjax-")
+
+
+def test_a_fault_of_the_compile_cache_is_one_warning(capsys):
+    """JAX repeats it for every program, of which a solve has a hundred."""
+    with cli._one_line_warnings():
+        for way in ("writing", "reading", "writing"):
+            for program in ("jit_run", "jit_stage"):
+                words = f"Error {way} persistent compilation cache entry for '{program}': OSError: {program}"
+                warnings.warn(words, UserWarning, stacklevel=1)
+        for _ in range(2):
+            warnings.warn("another one", UserWarning, stacklevel=1)
+    written, read, *others = capsys.readouterr().err.splitlines()
+    assert written.startswith("hjbjax: warning: compiled programs in ")
+    assert written.endswith(" cannot be written: OSError: jit_run; remove that folder, or give --no-cache")
+    assert " cannot be read: OSError: jit_run; " in read
+    assert others == ["hjbjax: warning: another one"] * 2
 
 
 # --- Ctrl-C ---

@@ -217,6 +217,23 @@ def test_a_process_that_is_not_needed_any_more_says_so(number, words, monkeypatc
     assert capsys.readouterr().out == words
 
 
+def test_the_first_process_checks_its_places_before_it_meets_the_others(tmp_path, monkeypatch):
+    """Another launch may have made the checkpoint meanwhile; the others would wait in the middle of the solve."""
+    as_member(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(launch, "mesh_of", None)
+    (tmp_path / "run.npz").touch()
+    refused(("solve", "pendulum", "--checkpoint", "run"), "run.npz already exists")
+
+
+@pytest.mark.parametrize("number", [None, "0", "1"])
+def test_a_process_of_a_launch_reports_that_it_has_begun(number, monkeypatch, capsys):
+    if number is not None:
+        as_member(monkeypatch, **{launch.RANK: number})
+    launch.arrive()
+    assert capsys.readouterr().out == ("" if number is None else f"{launch.ARRIVED}\n")
+
+
 # --- what is said at the end ---
 
 WAY_ON = "go on"
@@ -259,6 +276,11 @@ def test_the_first_process_has_said_it(outcome, code):
             outcome_of((0, -6), (1, 130), stopped=(1,)),
             7,
             "process 1 of 2 was stopped, and the others cannot go on without it; go on",
+        ),
+        (
+            outcome_of((0, -15), (1, -9), late=(1,), killed=(1,)),
+            7,
+            "process 1 of 2 did not start within 122 s; go on",
         ),
         (
             Outcome((End(1, 0, early=True), End(0, -6))),

@@ -15,6 +15,7 @@ import hjbjax as hjb
 from hjbjax.plotting import level_sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
+from hjbjax.solution.placement import FileError
 
 BALL = Grid([-1.0] * 3, [1.0] * 3, (21,) * 3, names=("x", "y", "z"))
 
@@ -100,6 +101,8 @@ def test_a_surface_that_can_be_turned_is_a_page_of_its_own(tmp_path):
     assert scene.figure.layout.scene.xaxis.title.text == "x [m]"
     scene.save(tmp_path / "ball.html")
     assert "x [m]" in (tmp_path / "ball.html").read_text(encoding="utf-8")
+    with pytest.raises(FileError, match="ball.html: cannot be written: there is no folder"):
+        scene.save(tmp_path / "missing" / "ball.html")
     with pytest.raises(ValueError, match="2 axes are free, wanted three"):
         plotting.turning_surface(solution(ball(0.6, grid), grid), fixed={"x": 0.0})
 

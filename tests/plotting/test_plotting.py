@@ -1,6 +1,8 @@
 """The pictures: what is drawn is compared with the solution's numbers, never with pixels."""
 
+import errno
 import io
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -20,6 +22,7 @@ from hjbjax.problem.labels import Labels
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.stretching import Sinh
+from hjbjax.solution.placement import FileError
 from hjbjax.solution.solution import Solution
 
 
@@ -128,7 +131,7 @@ from hjbjax.solution.solution import Solution
 grid = Grid([-1.0, -1.0], [1.0, 1.0], (5, 5))
 solution = Solution(grid, grid.nodes()[..., 0], grid.nodes()[..., :1], residuals=np.array([1.0, 0.1]))
 for draw in (plotting.value, plotting.policy, plotting.switching_curve, plotting.residuals):
-    draw(solution, ax=Figure().add_subplot()).save("/dev/null", format="png")
+    draw(solution, ax=Figure().add_subplot()).figure.savefig("/dev/null", format="png")
 assert dict(matplotlib.rcParams.copy()) == before
 assert "matplotlib.pyplot" not in sys.modules
 """
@@ -551,6 +554,37 @@ def test_a_picture_saves_itself(tmp_path):
     picture.save(tmp_path / "value.png")
     assert (tmp_path / "value.png").read_bytes().startswith(b"\x89PNG")
     assert repr(picture) == "Picture of 1 artists"
+
+
+def full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_picture_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    picture = plotting.value(line())
+    for name in ("value.png", "folder.png/value.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"old")
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(FileError, match=r"value\.png: cannot be written: No space left on device"):
+            picture.save(tmp_path / "value.png")
+    with pytest.raises(FileError, match=r"value\.png: cannot be written: there is no folder .*missing"):
+        picture.save(tmp_path / "missing" / "value.png")
+    with pytest.raises(FileError, match="cannot be written: it is a folder"):
+        picture.save(tmp_path / "folder.png")
+    with pytest.raises(ValueError, match="Format 'foo' is not supported"):
+        picture.save(tmp_path / "value.foo")
+    assert sorted(os.listdir(tmp_path)) == ["folder.png", "value.png"]
+    assert (tmp_path / "value.png").read_bytes() == b"old"
+
+
+def test_the_format_of_a_picture(tmp_path):
+    picture = plotting.value(line())
+    picture.save(os.fspath(tmp_path / "value"))  # with matplotlib's default
+    picture.save(tmp_path / "plain.txt", format="svg")
+    assert (tmp_path / "value.png").read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in (tmp_path / "plain.txt").read_bytes()
 
 
 def test_units_are_on_the_axes_and_the_colour_scale():

@@ -10,6 +10,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
+from hjbjax.solvers import transformed
 
 # name, nodes of each axis, or None for those of the problem
 QUICK = [("pendulum", (30, 31)), ("double-integrator", (21, 21)), ("bang-bang", (41,))]
@@ -77,6 +78,22 @@ def game(bound):
         lambda x, u, d: jnp.stack([u[0] + d[0], u[1] - 0.2 * x[0]]), lambda x, u, d: 1 + 0.5 * x[1] ** 2,
         hjb.Ball(bound, 2), disturbances=hjb.Finite([[-0.3], [0.3]]), target=lambda x: jnp.sqrt(x @ x + 1e-12) - 0.31,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("by", ["grad", "vmap"])
+def test_an_interrupt_on_the_host_is_one_for_the_caller(by, monkeypatch):
+    """It came out as an error of XLA's with the interrupt in its text."""
+
+    def pressed(*_):
+        raise KeyboardInterrupt
+
+    def value(rate):
+        problem = hjb.Problem(lambda x, u: rate * u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+        return hjb.solve(problem, hjb.Grid([-1.0], [1.0], (9,))).value[3]
+
+    monkeypatch.setattr(transformed, "_solved", pressed)
+    with pytest.raises(KeyboardInterrupt):
+        jax.grad(value)(0.5) if by == "grad" else jax.vmap(value)(jnp.ones(2))
 
 
 @pytest.mark.slow

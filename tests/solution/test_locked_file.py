@@ -73,6 +73,30 @@ def test_a_lock_ends_with_its_process(path):
     mine.close()
 
 
+@pytest.mark.filterwarnings("ignore:.*fork")  # of a process with threads
+def test_a_worker_that_outlives_its_run_keeps_no_lock(path):
+    """A process forked by a library, as by ``multiprocessing``, has copies of all handles."""
+    mine, other = LockedFile(path), LockedFile(path)
+    mine.write(text("one"))
+    (ended, end), (begun, begin) = os.pipe(), os.pipe()
+    if (worker := os.fork()) == 0:
+        os.close(end)
+        os.write(begin, b"!")
+        os.read(ended, 1)
+        os._exit(0)
+    try:
+        os.read(begun, 1)
+        with pytest.raises(FileError, match="another run is using it"):
+            other.take()
+        mine.close()  # as the system does when the run is killed
+        assert other.take()
+        other.close()
+    finally:
+        for handle in (ended, end, begun, begin):
+            os.close(handle)
+        os.waitpid(worker, 0)
+
+
 @pytest.mark.parametrize("links", [True, False], ids=["links", "no links"])
 def test_of_many_threads_one_gets_a_new_file(path, monkeypatch, links):
     if not links:

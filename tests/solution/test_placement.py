@@ -114,7 +114,7 @@ def test_of_two_commands_one_keeps_its_results(tmp_path):
             for name in made:
                 (folder / name).write_text(text)
         run_folder.publish(theirs, out, made)
-        with pytest.raises(FileExistsError, match="holds solution.npz, value.png already"):
+        with pytest.raises(FileExistsError, match="contains solution.npz, value.png already"):
             run_folder.publish(mine, out, made)
         out_again = tmp_path / "again"  # taken between the check and the move
         out_again.mkdir()
@@ -171,7 +171,38 @@ def test_a_command_replaces_no_pipe(tmp_path):
         run_folder.check_folder(tmp_path, force=True)
 
 
+def test_a_disk_that_became_read_only_is_the_reason_given(tmp_path, monkeypatch):
+    """Removing the half file fails as well, which used to be all that was reported."""
+    path = tmp_path / "run.npz"
+    write(path)
+    before = path.read_bytes()
+
+    def read_only(*_):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "fsync", read_only)
+    monkeypatch.setattr(os, "unlink", read_only)
+    with pytest.raises(FileError, match=r"run\.npz: cannot be written: Read-only file system"):
+        write(path, 1.0, force=True)
+    assert path.read_bytes() == before
+
+
 # --- names ---
+
+
+@pytest.mark.parametrize("there", [["run"], ["run", "run.npz"]])
+def test_a_folder_of_the_same_name(tmp_path, there):
+    """``hjbjax solve pendulum --checkpoint pendulum`` makes both, and could not be resumed."""
+    (tmp_path / "run").mkdir()
+    for name in there[1:]:
+        write(tmp_path / name, 1.0)
+    if there[1:]:
+        assert read(tmp_path / "run").tolist() == [1.0] * 3
+        write(tmp_path / "run", 2.0, force=True)
+        assert read(tmp_path / "run.npz").tolist() == [2.0] * 3
+    else:
+        with pytest.raises(FileError, match="run: cannot be written: it is a folder; give a file in it"):
+            write(tmp_path / "run")
 
 
 @pytest.mark.parametrize("name", ["é" * 125 + ".npz", "𝛽" * 62 + ".npz", "x" * 253 + ".b"])

@@ -1,9 +1,9 @@
 """A launcher of cheap children, as a script without JAX: it prints ``ready``, and at its end what became of them.
 
 The first argument is JSON: ``children``, the Python code of each, and optionally ``follow``, true for children that
-follow their launcher, ``grace``, ``settle`` and ``patience`` in seconds, ``farewell``, ``broken``, true for a last
-child that cannot be started, and ``ignored``, the names of signals that the launcher ignores. Each child finds its
-number in ``sys.argv[-1]`` and the functions of ``PRELUDE``.
+follow their launcher, ``grace``, ``settle`` and ``patience`` in seconds, ``farewell``, ``arrival``, its words and
+seconds, ``broken``, true for a last child that cannot be started, and ``ignored``, the names of signals that the
+launcher ignores. Each child finds its number in ``sys.argv[-1]`` and the functions of ``PRELUDE``.
 """
 
 import dataclasses
@@ -60,8 +60,14 @@ def main():
         commands.append(children.Command(["/no/such/program"], os.environ))
     print("ready", flush=True)
     try:
+        words, seconds = asked.get("arrival", ("", math.inf))
         outcome = children.run(
-            commands, [2, 3, 4, 130], [b"[muted]"], asked.get("patience", math.inf), asked.get("farewell", "").encode()
+            commands,
+            [2, 3, 4, 130],
+            [b"[muted]"],
+            asked.get("patience", math.inf),
+            asked.get("farewell", "").encode(),
+            (words.encode(), seconds),
         )
     except OSError as error:
         print(json.dumps({"error": str(error)}))

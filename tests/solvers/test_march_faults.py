@@ -54,7 +54,7 @@ LQ = hjb.Problem(plane, quadratic, Box([-3.0], [3.0]))
         (
             {"grid": hjb.Grid([-2.0], [2.0], (41,), stretch=(hjb.Sinh(2.0),)), "scheme": hjb.Eno2()},
             ValueError,
-            r"Eno2\(\) wants equal spacings",
+            r"Eno2\(\) requires equal spacings",
         ),
     ],
 )

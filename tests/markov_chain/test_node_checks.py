@@ -146,7 +146,7 @@ def test_coordinates_of_another_problem_are_not_advised():
     def noise(x, u):
         return jnp.stack([jnp.stack([x[0], 0.0]), jnp.stack([0.5 * x[0] * x[1], 0.5])])
 
-    refused("values", r"(?s)all nodes. Turn the", grid=Grid([0.5, 0.1], [4.0, 1.0], (11, 11)), noise=noise)
+    refused("values", r"(?s)all nodes. Rotate the", grid=Grid([0.5, 0.1], [4.0, 1.0], (11, 11)), noise=noise)
 
 
 def test_three_strong_correlations_are_beyond_any_spacing():

@@ -138,7 +138,7 @@ def trace(on: Discretisation, plan: Plan, held: Mask, *, running: bool) -> Arcs:
 def trace_chosen(on: Discretisation, plan: Plan, number: AtNodes, held: Mask) -> Arcs:
     """The arc of a plan selected by ``number`` at each node; differentiable.
 
-    The legs are those of ``trace``, in a loop of fixed length, which reverse-mode derivatives require.
+    The legs are the same as in ``trace``, in a loop of fixed length, which reverse-mode derivatives require.
     """
     count = len(plan.legs)
     u = [jnp.asarray(plan.actions)[number // count, j] for j in range(np.shape(plan.actions)[1])]

@@ -172,7 +172,7 @@ def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int
     pairs = list(itertools.product((1, -1), repeat=2))
     # a_ij⁺ along the diagonal, a_ij⁻ across it
     rate = {(p, q): jnp.maximum(entry * (p * q), 0) / scale for p, q in pairs}
-    for p, q in pairs:  # first across the walls of axis i, then across those of axis j, both at a corner
+    for p, q in pairs:  # first across the walls of axis i, then of axis j; both at a corner
         off = _reflecting(grid, i, p)
         rate[-p, q], rate[p, q] = rate[-p, q] + jnp.where(off, rate[p, q], 0), jnp.where(off, 0, rate[p, q])
     for p, q in pairs:

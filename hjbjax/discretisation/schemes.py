@@ -307,7 +307,7 @@ class Weno5(Scheme):
 
     Each one-sided slope is a mean of three third-order slopes with weights that favour the smoothest (see ``slopes``).
     Requires equal spacings and at least seven points per axis. If some of the seven nodes around a node are in a target
-    or unreachable, its slopes are those of ``Limited``. A stationary problem is solved as with ``Limited``, without a
+    or unreachable, it uses the slopes of ``Limited``. A stationary problem is solved as with ``Limited``, without a
     certificate. Noise is discretised by central differences, of order 2.
 
     Args:

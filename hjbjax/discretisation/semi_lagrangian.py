@@ -52,8 +52,7 @@ class SemiLagrangian:
     """Long characteristic steps with monotone interpolation, for deterministic problems whose paths follow kinks.
 
     From each node arcs of 1, about √``cells`` and ``cells`` cells are tried, each under one constant action. V_h is the
-    fixed point of the minimum over them, for a Markov chain with long jumps. The certificates are those of ``Upwind``
-    with jumps instead of rates: V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ}) with a discount, and
+    fixed point of the minimum over them, for a Markov chain with long jumps. The certificates are the same as for ``Upwind``, with jumps instead of rates: V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ}) with a discount, and
     V/(1 + max(−r/c)) ≤ V_h ≤ V/(1 − max(r/c)) without. Here r is the cost of an arc minus V, c its running cost; the
     lower bound uses all arcs, the upper bound the best arc from each node. The scheme is first order in general, with a
     far smaller constant than the chain where V has kinks: for the double integrator's minimum time a seventh of the

@@ -11,7 +11,7 @@ p, q, r, s, the slope from below is
 
     S₀ = 13/12 (q − p)² + ¼ (3q − p)²,  S₁ = 13/12 (r − q)² + ¼ (q + r)²,  S₂ = 13/12 (s − r)² + ¼ (s − 3r)²,
 
-c = (0.1, 0.6, 0.3); the slope from above is its mirror image. At a kink the order is that of the best of three
+c = (0.1, 0.6, 0.3); the slope from above is its mirror image. At a kink the slope is as accurate as the best of three
 third-order stencils. The slopes in S_k are scaled by the range of V over the width of the box, so ε = 10⁻⁶ has no unit.
 Beyond an end the value is extrapolated quadratically, or mirrored where noise reflects; across a wall the slope is
 zero, as in every scheme here. The terms are ordered so that XLA fuses them into one loop without temporary arrays.

@@ -297,7 +297,7 @@ def limited(
     """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across a wall.
 
     Next to an edge, and to the boundary of a target, the second difference is extrapolated as a constant. At a wall on
-    which noise reflects, according to ``noisy``, it is that of the mirror image (see ``noisy_walls``).
+    which noise reflects, according to ``noisy``, the mirror image gives it (see ``noisy_walls``).
     """
     bend = 2 * (up - down) / (link.up + link.down)  # V'' from two gaps of any lengths
     for step in (1, -1):

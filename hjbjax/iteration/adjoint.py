@@ -8,8 +8,8 @@ The value V of a converged solve satisfies Φ(V, θ) = 0. At each node Φ is the
 ∂Φ/∂θ is taken through the formulas for the optimal action. These contribute nothing where the action is stationary, but
 they do where it is at a bound or at a kink of the upwinding, since both may move with θ. Forward mode takes one linear
 solve and reverse mode one transposed solve, independently of the number of steps that led to V. A linear solve that
-does not converge makes the derivative NaN; the value is unchanged. The derivative of the policy is that of the optimum
-of the Hamiltonian in V and θ, see ``sensitivity``.
+does not converge makes the derivative NaN; the value is unchanged. The policy is differentiated as the optimum of the
+Hamiltonian in V and θ, see ``sensitivity``.
 
 With high-order slopes Φ is not linear in V, and its derivative is not the matrix of a chain. The limited slopes are
 then differentiated at fixed actions, and a Krylov method, preconditioned by sweeps with I − W, solves the linear

@@ -10,7 +10,7 @@ discount the running cost c > 0 of an arc replaces 1 − κ in V/(1 + η) ≤ V_
 
 A step follows each node's best arc several times and then evaluates all arcs, which is modified policy iteration. Value
 iteration follows it once. Because an arc crosses several cells, information travels from the target to the ends of the
-box in as many relaxations as there are arcs along the path.
+box in one relaxation per arc of the path.
 """
 
 import dataclasses
@@ -99,8 +99,8 @@ def start(task: ArcTask) -> Field:
 
     From below, every node would first take the shortest arc, which pays least, and V would rise by one cell per
     relaxation. With a discount the start is a constant V with min Q ≤ V: the largest over the nodes of min pay/(1 −
-    keep). Without a discount there is no such constant; the start is the cost of as many arcs as the axes have nodes,
-    at the most expensive node.
+    keep). Without a discount there is no such constant; the start is the cost of one arc at the most
+    expensive node, times the sum of the nodes over the axes.
     """
     arcs, free = task.arcs, task.counted & ~task.obstacles.fixed
     least = jnp.full(task.grid.shape, jnp.inf, arcs.pay.dtype)

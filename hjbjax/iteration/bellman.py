@@ -130,8 +130,8 @@ def greedy(
 ) -> Greedy:
     """The optimal actions at ``value`` and the defect r; an incumbent policy is among the candidates.
 
-    Drift that is only rounding does not lead to ``lost`` nodes, bool (*grid). Where ``first_order`` is true the slopes
-    are those of the chain.
+    Drift that is only rounding does not lead to ``lost`` nodes, bool (*grid). Where ``first_order`` is true
+    the slopes of the chain are used.
     """
     return _with_defect(on, value, held, *optimum.optimise(_around(on, value, incumbent, lost, first_order)))
 

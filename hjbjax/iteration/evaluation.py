@@ -89,7 +89,7 @@ class Evaluation(abc.ABC):
 class Sweeps(Evaluation):
     """Approximate evaluation by Gauss–Seidel: ``count`` forward and backward sweeps in every order of the axes.
 
-    The work is about that of ``count`` 2^n relaxations of every node. Runs in float32 on the correction. If the grid
+    The work is about equal to ``count`` 2^n relaxations of every node. Runs in float32 on the correction. If the grid
     exceeds the cache of a CPU, each slab of it is swept 2 ``count`` - 1 times (at least three) in each of two
     directions.
     """
@@ -288,7 +288,7 @@ def relaxed(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi if diagonal jumps break the wavefront.
 
     At open ends the correction is extrapolated as a constant. For an equation with a parabola beyond them this is a
-    preconditioner, not a solver, since the values outside follow those of δ inside.
+    preconditioner, not a solver, since the values outside depend on δ inside.
     """
     equation = _walled(equation, grid)
     # a diagonal jump may stay on its hyperplane i₀ + i₁ + … = const, whose nodes are updated simultaneously

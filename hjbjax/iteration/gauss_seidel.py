@@ -8,7 +8,7 @@ cyclically along the first axis,
 so that such a hyperplane is one slice S[d] (or several, folded). Its neighbours are in S[d − 1] and S[d + 1], shifted
 by one entry for the axes beyond the first. A forward sweep goes through the slices upwards, a backward sweep downwards,
 and flipping axes beyond the first before skewing gives all 2ⁿ orders. Values across the seam of a periodic axis beyond
-the first are those of the previous sweep.
+the first are from the previous sweep.
 
 If the arrays exceed a processor's cache, slabs of slices are swept several times instead of all slices once.
 

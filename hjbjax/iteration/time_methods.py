@@ -366,7 +366,7 @@ class ImplicitStep:
 
     @classmethod
     def of(cls, on: Discretisation, obstacles: Obstacles, value: Field, dt: Number) -> "ImplicitStep":
-        """The problem whose solution is V a time Δt before that of ``value``, for the chain at that earlier time."""
+        """The problem whose solution is V a time Δt before ``value``, for the chain at that earlier time."""
         rate = 1 / stretched(dt, on.problem, value.dtype)
         # not by Problem(...), which refuses a discount together with a running maximum
         shifted = altered(on.problem, discount=on.problem.discount + rate)

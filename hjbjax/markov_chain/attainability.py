@@ -36,7 +36,7 @@ def _open_jumps(
 ) -> Rates:
     """For every jump the nodes, bool (*grid), with an action that makes it and whose jumps all stay ``inside``.
 
-    Tries the first ``count`` actions of ``points``. If ``inside`` is None it is the box. Rates up to ``least`` count as
+    Tries the first ``count`` actions of ``points``. ``inside=None`` means the box. Rates up to ``least`` count as
     rounding. With ``kinks``, the actions between samples at which a component of the drift vanishes are tried too.
     """
     known = _no_jumps(on, points)
@@ -260,7 +260,7 @@ def _cheap_somewhere(on: Discretisation, inside: jax.Array, dearest: Scalar, pai
 def _refuge(
     on: Discretisation, start: jax.Array, dearest: Scalar | None, pairs: Array, count: int | Scalar
 ) -> jax.Array:
-    """``refuge`` in the set ``start`` for the first ``count`` rows of ``pairs``: the inputs of u, then those of d."""
+    """``refuge`` in the set ``start`` for the first ``count`` rows of ``pairs``, with the inputs of u, then of d."""
     mine, pairs = players_of(on).control, jnp.asarray(pairs, on.dtype)
     m = len(mine.driven)
 

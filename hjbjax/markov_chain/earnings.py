@@ -56,7 +56,7 @@ def earned(task: Task, state: State) -> Earning | None:
     values = [np.where(going, rate, 0) for rate in jumps.values]
     generator = stencil.sparse(jumps.offsets, values, -np.sum(values, axis=0), task.grid)
     for states in stationary_law.classes(generator):
-        # a fixed node is a class of its own, without further payments
+        # a fixed node is a separate class, without further payments
         if not going.flat[states[0]]:
             continue
         paid = cost.flat[states]

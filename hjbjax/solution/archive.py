@@ -31,7 +31,7 @@ def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a solution.
 
     Raises:
-      ValueError: the arrays do not fit the grid, for example those of a batch.
+      ValueError: the arrays do not fit the grid, for example the arrays of a batch.
     """
     grid = solution.grid
     header = {

@@ -90,7 +90,6 @@ class Solution:
       message: an explanation of the outcome of this solve; empty on return from ``jit``; host data.
       problem: the problem, for target and bounds in plots; ``None`` on return from ``jit`` or from a file, because
         functions are not saved; host data.
-        file, as functions are not saved; host level.
 
     Example:
       >>> grid = Grid([0.0], [1.0], (3,))

@@ -1,7 +1,7 @@
 """Many problems on one grid at once: ``solve_batch``.
 
-Problems that differ only in numbers share their programs. On a CPU each lane is a separate solve, and as many run in
-parallel as there are cores: JAX releases other threads while a program runs, and a solve keeps one core busy most of
+Problems that differ only in numbers share their programs. On a CPU each lane is a separate solve, and one runs
+per core in parallel: JAX releases other threads while a program runs, and a solve keeps one core busy most of
 the time. Two cores gave 1.8 times the solves per second on 100 x 101 nodes. Lanes of one ``vmap``ped loop gave 0.9 to
 1.3, since sweeps are still a loop over slices, and every lane pays for the steps of the slowest.
 
@@ -85,7 +85,7 @@ def solve_batch(
     resume: bool = False,
     mesh: Mesh | None = None,
 ) -> list[Solution]:
-    """Solve many problems on one grid; each solution is the same as that of ``solve`` by this method.
+    """Solve many problems on one grid; each solution is the same as from ``solve`` with this method.
 
     Args:
       problems: problems; those with the same functions and shapes share a program, whatever their numbers.

@@ -70,7 +70,7 @@ class _Coarse(NamedTuple):
 
     Attributes:
       on: the problem on the coarser grid; None if there is nothing to march.
-      longer: the ratio of the steps to those of the finer march.
+      longer: the ratio of the steps to the steps of the finer march.
       kept: the indices of the kept times that the coarse march keeps.
       reason: why there is no estimate of the grid error; empty if there is one.
     """

@@ -147,7 +147,7 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
 
 
 def _highest(settled: Settled) -> float:
-    """The largest possible order of the error: that of the scheme, lower for a target smaller than a cell."""
+    """The largest possible order of the error: the scheme's, or lower for a target smaller than a cell."""
     if grid_error.is_a_point(np.asarray(settled.task.obstacles.ended)):
         return grid_error.LEAST
     return grid_error.FIRST if settled.note else grid_error.SECOND
@@ -247,8 +247,8 @@ def warn_of_cuts(cut: np.ndarray, ends: np.ndarray, grid: Grid) -> None:
     ]
     if most:
         warn(
-            f"the optimal drift leaves the box and is cut off at {', '.join(most)}, as if a wall stood there on which "
-            "to lean is free: near such an end the value is not that of your problem. Choose the box larger, or "
+            f"the optimal drift leaves the box and is cut off at {', '.join(most)}, as if there were a wall. "
+            "Near this boundary the value does not solve your problem. Use a larger box, or "
             "Grid(..., edges='constrained') or 'open'"
         )
 

@@ -39,7 +39,7 @@ from hjbjax.solvers.stationary_run import StatesInChunks
 REPLACEMENT = SemiLagrangian()  # replaces the chain if this is carried past the target
 REASON = (
     "It was solved by SemiLagrangian(): the Markov chain of Upwind() and Limited() spreads by about a cell per step "
-    "and may be carried past the target, so its expected cost is infinite where that of the path is finite."
+    "and may be carried past the target, so its expected cost is infinite where the cost of the path is finite."
 )
 FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 WORDS = {

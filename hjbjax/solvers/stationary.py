@@ -37,7 +37,7 @@ from hjbjax.solvers.transformed import Asked
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
-# inside a transformation nobody monitors the steps: a limit far above the steps of policy iteration
+# inside a transformation the steps are not monitored: a limit far above the steps of policy iteration
 TRACED_STEPS = 10_000
 
 

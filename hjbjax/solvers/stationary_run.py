@@ -70,8 +70,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
       most: the largest number of steps, if less than the clock allows, for iterations that only improve a guess.
 
     Returns:
-      The last state, its status, and the residuals of all steps, starting with that of the guess.
-      The last state, how it ended, and the residuals of all steps, that of the guess first.
+      The last state, its status, and the residuals of all steps, starting with the guess.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
     parts = task.on.parts

@@ -3,7 +3,7 @@
 Between programs the host decides which certificate holds, whether to use vanishing discounts, from which nodes a target
 can be forced, which rest nodes are left, when to replace stalled sweeps by linear solves, and the order. A compiled
 program could not make these decisions with the same method. It therefore calls the host, once for all lanes of a
-``vmap``, and the result is that of ``solve`` to the last bit. Derivatives do not involve the steps: they are the
+``vmap``, and the result equals that from ``solve`` to the last bit. Derivatives do not involve the steps: they are the
 derivatives of the equation that the solution satisfies, by the implicit function theorem, and are compiled.
 
 Each lane runs as in ``solve``, on the caller's device, in float64 unless float32 was requested.

@@ -279,7 +279,7 @@ def over_nodes(task: T, shape: tuple[int, ...]) -> T:
     def mark(leaf: Any) -> bool:
         return np.shape(leaf) == shape
 
-    on: Discretisation = task.on
+    on = task.on
     # except the leaves of the problem and the grid, which may have this shape by chance
     nothing, cut = jax.tree.map(lambda _: False, on), jax.tree.map(mark, on.cut)
     return altered(jax.tree.map(mark, altered(task, on=None)), on=altered(nothing, cut=cut))
@@ -287,8 +287,7 @@ def over_nodes(task: T, shape: tuple[int, ...]) -> T:
 
 def on_part(task: T, parts: Parts) -> T:
     """A task, or a march, on the part of one device, inside ``shard_map``."""
-    on: Discretisation = task.on
-    return altered(task, on=altered(on, grid=on.grid.divided(parts)))
+    return altered(task, on=altered(task.on, grid=task.on.grid.divided(parts)))
 
 
 @dataclasses.dataclass(frozen=True)

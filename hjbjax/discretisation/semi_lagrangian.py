@@ -52,11 +52,13 @@ class SemiLagrangian:
     """Long characteristic steps with monotone interpolation, for deterministic problems whose paths follow kinks.
 
     From each node arcs of 1, about √``cells`` and ``cells`` cells are tried, each under one constant action. V_h is the
-    fixed point of the minimum over them, for a Markov chain with long jumps. The certificates are the same as for ``Upwind``, with jumps instead of rates: V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ}) with a discount, and
-    V/(1 + max(−r/c)) ≤ V_h ≤ V/(1 − max(r/c)) without. Here r is the cost of an arc minus V, c its running cost; the
-    lower bound uses all arcs, the upper bound the best arc from each node. The scheme is first order in general, with a
-    far smaller constant than the chain where V has kinks: for the double integrator's minimum time a seventh of the
-    mean error. A target ends where its l is zero, between the nodes; a target of a single node is met by interpolation.
+    fixed point of the minimum over them, for a Markov chain with long jumps. The certificates are the same as for
+    ``Upwind``, with jumps instead of rates: V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ}) with a discount,
+    and V/(1 + max(−r/c)) ≤ V_h ≤ V/(1 − max(r/c)) without. Here r is the cost of an arc minus V, c its running cost;
+    the lower bound uses all arcs, the upper bound the best arc from each node. The scheme is first order in general,
+    with a far smaller constant than the chain where V has kinks: for the double integrator's minimum time a seventh of
+    the mean error. A target ends where its l is zero, between the nodes; a target of a single node is met by
+    interpolation.
 
     The minimum is over these arcs only. Their actions are the elements of a ``Finite`` set. If drift and cost are
     affine in the control, they are the corners of a box, or about ``actions`` directions on the boundary of a ball.

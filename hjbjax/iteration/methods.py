@@ -26,10 +26,10 @@ method of damped Jacobi sweeps:
 ``correct`` is traced, and the object enters compiled programs as a pytree, here without numbers. The loop does the
 rest: the certificate, the constraints, and stopping when steps make no progress.
 
-In a game the value of the outer player's policy is the value of the inner player's problem against it (``evaluated``). The
-inner player responds, the response is evaluated, and so on, until the residual of this problem is a tenth of the outer
-residual, or a millionth after the outer residual has risen. Then the outer player improves. Improving both at once may
-cycle. After A. J. Hoffman and R. M. Karp.
+In a game the value of the outer player's policy is the value of the inner player's problem against it (``evaluated``).
+The inner player responds, the response is evaluated, and so on, until the residual of this problem is a tenth of the
+outer residual, or a millionth after the outer residual has risen. Then the outer player improves. Improving both at
+once may cycle. After A. J. Hoffman and R. M. Karp.
 """
 
 import abc

@@ -14,7 +14,7 @@ from hjbjax.solution import files, placement
 from hjbjax.solution.placement import FileError
 
 TRIES = 100  # attempts to open a file that others keep replacing
-Held: TypeAlias = tuple[os.stat_result, int | None]  # identity of the file, and a handle that keeps its lock
+Held: TypeAlias = tuple[os.stat_result, int | None]  # which file, and a handle that keeps its lock
 
 
 class LockedFile:
@@ -26,7 +26,7 @@ class LockedFile:
 
     def __init__(self, path: str):
         self.path = path
-        self._own: list[Held] = []  # the run's file at the path, and during a write also its replacement
+        self._own: list[Held] = []  # the run's file at the path, and during a write the one that will replace it
 
     def take(self) -> bool:
         """Lock the file at the path and return True; return False if there is none.

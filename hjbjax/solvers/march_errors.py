@@ -226,7 +226,7 @@ def _steps(task: March, longer: float) -> jax.Array:
     return jnp.where(step < float(task.horizon) / time_probes.PARTS * (1 - 1e-6), step, longer * step)
 
 
-def _limit(task: March, on: Discretisation) -> jax.Array | None:
+def _limit(task: March, on: Discretisation) -> Number | None:
     """The longest stable step on a coarser grid; None if it is computed before every step.
 
     If all spacings grow by r, the rates Q fall by at least r, so the limit is known without compiling a program.

@@ -237,8 +237,11 @@ def test_functions_of_another_shape_are_refused_where_nothing_else_would_tell():
         (lambda: hjb.chain.generator(GRID, problem()), "generator: got Grid, Problem; wanted a Problem and a Grid"),
         (lambda: hjb.attenuation(GRID, 1.0, U), "attenuation: got Grid, wanted a Problem"),
         (lambda: hjb.solve_batch([problem(), 3], GRID), "solve_batch: lane 1 is 3; wanted only problems"),
-        (lambda: hjb.Grid([0.0], [1.0], (3,), stretch="sinh"), "Grid.stretch: got 'sinh', wanted one an axis"),
-        (lambda: hjb.Grid([0.0], [1.0], (3,), stretch=hjb.Sinh(3.0)), r"wanted one an axis, as in \(hjb.Sinh\(3.0\)"),
+        (lambda: hjb.Grid([0.0], [1.0], (3,), stretch="sinh"), "Grid.stretch: got 'sinh', wanted one entry per axis"),
+        (
+            lambda: hjb.Grid([0.0], [1.0], (3,), stretch=hjb.Sinh(3.0)),
+            r"wanted one entry per axis, as in \(hjb.Sinh\(3.0\)",
+        ),
     ],
 )
 def test_arguments_that_changed_places_are_told(ask, said):

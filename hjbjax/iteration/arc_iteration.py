@@ -212,7 +212,7 @@ def _judge(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar) -> Sca
 def arriving(arcs: Arcs, grid: Grid, held: Mask, inside: AtNodes | None = None) -> AtNodes:
     """The nodes that some choice of arcs may bring to the target, without leaving ``inside``, bool (*grid).
 
-    Of the corners of the cell in which such an arc ends, one is nearer to the target, and all are inside.
+    Such an arc ends in a cell whose corners are all inside, at least one of them nearer to the target.
     """
     zero = jnp.zeros(grid.shape, arcs.pay.dtype)
     outside = widened(zero if inside is None else zero + ~inside, grid)

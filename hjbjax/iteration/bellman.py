@@ -184,7 +184,7 @@ def respond(
     # the current response is among the candidates, so a sampled player never gets worse
     hamiltonian = _around(on, value, current, lost, first_order)
     u, d = list(current.controls), list(current.disturbances)
-    if on.problem.isaacs == "upper":  # min max: the control moves first, and the disturbance knows it
+    if on.problem.isaacs == "upper":  # min max: the control moves first, and the disturbance responds
         best, d = optimum.best_response(hamiltonian, players.disturbance, lambda d: (u, d))
     else:
         best, u = optimum.best_response(hamiltonian, players.control, lambda u: (u, d))

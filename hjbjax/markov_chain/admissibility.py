@@ -29,7 +29,7 @@ def values(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
       t: the time, if the problem depends on it.
 
     Raises:
-      ValueError: with the number of nodes, the first node and its state, and a remedy.
+      ValueError: some node has no admissible action; names the first such node and a remedy.
     """
     if not grid.sides("constrained"):
         return

@@ -51,12 +51,12 @@ def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
             weights = n  # one direction per axis, since sweeps may merge both
         correction = method.evaluation.bytes_per_node(weights, word)
     elif is_discounted(problem) and not searched:
-        # a step computes only the defect; at the end come the actions and the pace
+        # the actions, computed at the end, and the outflow Q + β; a step computes only the defect
         look = word * (actions + 1 + (problem.noise is not None or is_constrained(problem)))
     else:
-        look = word * (4 * max(actions, 1) + 1)  # the last one is the pace
+        look = word * (4 * max(actions, 1) + 1)  # one for the outflow Q + β
         if problem.stopping_cost is not None and not problem.is_game and is_discounted(problem) is False:
-            # ties are resolved in favour of stopping, which evaluates every rate
+            # on ties the old policy is kept, which requires every rate
             look = max(look, math.ceil(word * (2.5 * n + actions)))
     return (kept + max(look + word * searched, correction)) * grid.size
 
@@ -117,7 +117,7 @@ def _searched(problem: Problem, n: int, dtype: DType) -> int:
 def available() -> int | None:
     """Free bytes on the device that JAX computes on; None if unknown."""
     device = jax.devices()[0]
-    # on a CPU the operating system reports them, below
+    # on a CPU the operating system reports the free memory, below
     stats = device.memory_stats() if device.platform != "cpu" else None
     if stats and "bytes_limit" in stats:
         return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
@@ -195,7 +195,7 @@ def require(problem: Problem, grid: Grid, method: Method, dtype: DType, limit: i
     """The estimated bytes of a solve, if they fit.
 
     Raises:
-      MemoryError: with the estimate, the free memory, and the largest N that fits.
+      MemoryError: the bytes do not fit; reports the estimate, the free memory, and the largest N that fits.
     """
     return fitting(estimate(problem, grid, method, dtype), grid, limit)
 

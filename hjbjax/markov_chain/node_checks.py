@@ -38,7 +38,7 @@ def values(on: Discretisation, clock: Clock | None = None) -> None:
       clock: checks the limits between batches of actions; raises ``Stopped``.
 
     Raises:
-      ValueError: with the number of nodes, the first node and its state, and a remedy.
+      ValueError: a value is refused; names the number of nodes, the first one with its state, and a remedy.
     """
     clock, problem, grid, scheme = clock or Clock(), on.problem, on.grid, on.scheme
     actions = _actions(problem)

@@ -41,7 +41,7 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
     """An action, and copies with some inputs moved to where a component of the drift vanishes; each input (*grid).
 
     Only there may a jump vanish that all samples make. If the drift is not affine in the inputs there are none. For a
-    single input they do not depend on the action; see ``beside_samples``.
+    single input the kinks do not depend on the action; see ``beside_samples``.
     """
     found = [action]
     if not _knows_kinks(on, player) or len(player.driven) == 1:

@@ -7,7 +7,7 @@ since it is 2 where V is smooth, 1 next to kinks and corners, and lower where V 
 lower of two observed orders:
 
 - The second-order scheme changes the value of the monotone chain by the whole first-order error of the chain. If the
-  change between the grids is much smaller than this change, q is 2. If both are similar, q is 1.
+  change between the grids is much smaller than this change, q is 2. If the two changes are similar, q is 1.
 - Second differences of V fall like h² where V is smooth, like h at a kink, and not at all at a jump or in a layer that
   is thinner than a cell.
 

@@ -28,8 +28,8 @@ from hjbjax.solvers.result import isaacs_gap, warn_of_gap
 
 CERTIFICATE = "a march has no certificate; halve the spacings and the step to see its error"
 ADVICE = {
-    Status.DIVERGED: "The value blows up: the worst disturbance reached its bound inside the box. With a wider box of "
-    "disturbances it blows up later; if the bound is part of the problem, pass inner=0.",
+    Status.DIVERGED: "The value blows up: the worst disturbance reached its bound inside the box. Use a wider box of "
+    "disturbances to see how fast; if the bound is part of the problem, pass inner=0.",
     Status.NONFINITE: "NaN or infinity appeared in the next step, and the last finite value is kept; check drift "
     "and costs, or use a shorter step.",
     Status.TIME_LIMIT: "Reached time_limit; raise it, or continue from the value so far with start=.",

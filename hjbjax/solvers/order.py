@@ -10,7 +10,7 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.solvers.setup import Assumptions
 
-AHEAD = 2.0  # a corrective time step is the time to cross the box, divided by this
+AHEAD = 2.0  # the time to cross the box, over the length of a corrective time step
 
 
 def staged(task: Task, scheme: Scheme) -> Task:

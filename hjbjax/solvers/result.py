@@ -33,7 +33,7 @@ GAP = 0.05  # relative to the actions' influence; if Isaacs' condition holds, up
 COARSE = 0.1  # fraction of the range of V: a larger grid error is worth a warning ...
 NODES = 0.05  # ... at more than this fraction of the nodes
 FLAT = 1e-3  # fraction of max |V|: a smaller range is not a scale for errors
-MOST = 2 / 3  # fraction of an end's nodes: a velocity leaves at half of the nodes where its position ends
+MOST = 2 / 3  # fraction of an end's nodes; at the end of a position, its velocity points outwards at half of them
 
 
 def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:

@@ -168,7 +168,7 @@ class StatesInChunks:
         bar.set_postfix_str(f"error {error:.2e}, tol {tol:.0e}", refresh=False)
 
     def keep(self, error: Exception) -> None:
-        """Attach the value to an exception: of the failed step, the previous state unless donated, or the guess."""
+        """Attach the best available value to an exception: of the last state, the previous state, or the guess."""
         host_loop.keep(error, self.task.grid, lambda: self.state.value, lambda: self.before.value, lambda: self.guess)
 
 

@@ -169,7 +169,7 @@ def _enough_for_integrals(errors: np.ndarray) -> np.ndarray:
     chosen, parts = np.zeros(PARTS, int), np.arange(PARTS)
     while np.sum(errors[chosen, parts]) > INTEGRAL:
         now = np.where(chosen < len(CUTS) - 1, errors[chosen, parts], 0)
-        if np.max(now) <= INTEGRAL / PARTS / 10:  # no improvement is needed
+        if np.max(now) <= INTEGRAL / PARTS / 10:  # shorter steps do not help
             break
         chosen += now >= np.max(now) / 2
     return chosen

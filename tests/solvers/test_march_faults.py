@@ -147,7 +147,7 @@ def test_times_and_what_they_hold(tmp_path):
     assert again.value_at(0.65, [0.5]) == solution.value_at(0.65, [0.5])
     between = (solution.value_at(0.3, [0.5]) + solution.value_at(1.0, [0.5])) / 2
     assert solution.value_at(0.65, [0.5]) == pytest.approx(between, rel=1e-12)
-    with pytest.warns(UserWarning, match="lie outside the kept ones"):
+    with pytest.warns(UserWarning, match="lie outside the kept times"):
         assert np.isnan(solution.value_at(1.5, [0.5]))
     assert solution.value_at(1.5, [0.5], clamp=True) == solution.value_at(1.0, [0.5])
     several = solution.value_at([0.0, 0.3], [[0.5], [-0.5]])

@@ -321,7 +321,7 @@ REFUSED = {
     ),
     "other methods": (
         lambda: hjb.solve(rest(), LINE, scheme=hjb.SemiLagrangian(), method=hjb.PolicyIteration(hjb.Krylov())),
-        "no matrix",
+        "not have a matrix",
     ),
     "coarser grids": (lambda: hjb.solve(rest(), LINE, scheme=hjb.SemiLagrangian(), method=hjb.Nested()), "one grid"),
     "transformations": (

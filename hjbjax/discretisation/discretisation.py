@@ -1,6 +1,6 @@
-"""A problem on a grid, discretised by a scheme; and the base classes of schemes.
+"""A problem discretised on a grid by a scheme, and the base classes of schemes.
 
-``schemes`` shows how to write a scheme of your own.
+``schemes`` shows how to write a custom scheme.
 """
 
 import abc
@@ -28,15 +28,15 @@ T = TypeVar("T", bound=Any)
 
 
 class Scheme(abc.ABC):
-    """The base class of schemes, which say what slopes the drift sees.
+    """The base class of schemes, which define the slopes of V in the drift term.
 
     A scheme is a frozen, hashable value without traced numbers. It defines ``chain`` and ``slopes``; everything else
-    has a default, given here.
+    has a default.
     """
 
     @property
     def monotone(self) -> bool:
-        """True if the scheme is a Markov chain (``Chain``): only then are its answers certified."""
+        """True if the scheme is a Markov chain (``Chain``); only then its solutions are certified."""
         return False
 
     @property
@@ -46,43 +46,43 @@ class Scheme(abc.ABC):
 
     @property
     def even(self) -> bool:
-        """True if the scheme needs equal spacings along every axis."""
+        """True if the scheme requires equal spacings along every axis."""
         return False
 
     @property
     def subcell(self) -> bool:
-        """True if the boundary of a target is met between two nodes."""
+        """True if the boundary of a target is resolved between nodes."""
         return False
 
     @property
     def split(self) -> bool:
-        """True if the drifts of two players who drive one component are upwinded separately, see ``Upwind``."""
+        """True if the drifts of two players who drive the same component are upwinded separately, see ``Upwind``."""
         return False
 
     @property
     def stages(self) -> int:
-        """The number of stages, and the order, of the explicit Runge–Kutta method that suits it: 1, 2 or 3."""
+        """The stages, and the order, of a suitable explicit Runge–Kutta method: 1, 2 or 3."""
         return 2
 
     @property
     def points(self) -> int:
-        """The number of nodes that every axis must have."""
+        """The least number of nodes per axis."""
         return 2
 
     @property
     def blends(self) -> bool:
-        """True if ``slopes`` returns the one-sided differences itself where ``Differences.first_order`` says so."""
+        """True if ``slopes`` returns the one-sided differences where ``Differences.first_order`` is true."""
         return False
 
     @property
     def in_parts(self) -> bool:
-        """True if ``slopes`` reads other nodes through ``stencil`` only, so that many devices can share the nodes."""
+        """True if ``slopes`` reads other nodes through ``stencil`` only, so that devices can share the nodes."""
         return False
 
     @property
     @abc.abstractmethod
     def chain(self) -> "Chain":
-        """The monotone chain behind it, as ``Upwind()``: it starts and corrects, and limits explicit steps."""
+        """The monotone chain of the scheme, such as ``Upwind()``: gives start, corrections and explicit step limits."""
 
     @abc.abstractmethod
     def slopes(self, around: "Differences") -> Sequence[tuple[jax.Array, jax.Array]]:
@@ -90,12 +90,12 @@ class Scheme(abc.ABC):
 
 
 class Chain(Scheme):
-    """The base class of monotone schemes, which are Markov chains: along an axis drift f and diffusion a gain
+    """The base class of monotone schemes, which are Markov chains: along an axis drift f and diffusion a give
 
         [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻),    e ≥ max(a, h⁺ f, −h⁻ f),
 
-    with distances h⁺ and h⁻ to the two neighbours; e(f) rises by at most h|f|. A chain defines ``excess`` and
-    ``kinks``. ``schemes`` explains what happens at a wall, and shows an example.
+    with distances h⁺ and h⁻ to the two neighbours; e(f) increases by at most h|f|. A chain defines ``excess`` and
+    ``kinks``. ``schemes`` explains the treatment of walls, and shows an example.
     """
 
     monotone, stages = True, 1
@@ -116,32 +116,31 @@ class Chain(Scheme):
 
     @abc.abstractmethod
     def excess(self, f: Any, a: Any, link: Links) -> Any:
-        """e, the diffusion along an axis."""
+        """The diffusion e along an axis."""
 
     @abc.abstractmethod
     def kinks(self, a: Any, slopes: tuple[Any, Any], link: Links) -> tuple[Sequence[Any], Sequence[Any]]:
-        """The drifts f, in order, at which the gain's derivative jumps, and the derivatives between them: one more.
+        """The drifts f, increasing, at which the derivative of the gain jumps, and its derivatives between them.
 
-        ``slopes`` are D⁺ and D⁻. At most three kinks.
+        There are at most three kinks, and one more derivative than kinks. ``slopes`` are D⁺ and D⁻.
         """
 
 
 @pytree_dataclass(static=("scheme", "dtype", "mesh"))
 class Discretisation:
-    """A problem on a grid by a scheme, in one floating-point type and at one time.
+    """A problem on a grid, discretised by a scheme, in one floating-point type and at one time.
 
-    Its methods evaluate the functions of one state on all nodes at once: an action is a list of its components, each a
-    number or an array that broadcasts over the nodes, and so is what they return.
+    The methods evaluate the problem's functions at all nodes at once. An action is a list of its components, each a
+    number or an array that broadcasts over the nodes; results have the same form.
 
     Args:
-      problem: the question.
-      grid: the nodes.
-      scheme: how derivatives are made.
+      problem: the problem.
+      grid: the grid.
+      scheme: the scheme for the derivatives.
       dtype: the floating-point type of all node values.
-      t: the time, which matters if the problem's functions depend on it.
-      cut: the links that end on the boundary of a target, kept by ``cut_cells``; None: made anew wherever they are
-        wanted.
-      mesh: the devices over which the nodes are divided while steps are made; None: one.
+      t: the time, used if the problem depends on it.
+      cut: the links that end on the boundary of a target, stored by ``cut_cells.kept``; None: computed on use.
+      mesh: the devices over which the nodes are divided during the iteration; None: one device.
     """
 
     problem: Problem
@@ -153,12 +152,12 @@ class Discretisation:
     mesh: Mesh | None = None
 
     def __post_init__(self):
-        # jnp.float32 and "float32" are other keys than np.dtype: one program would be compiled for each
+        # jnp.float32 and "float32" hash differently from np.dtype, so each would compile its own program
         object.__setattr__(self, "dtype", np.dtype(self.dtype))
 
     @property
     def chain(self) -> "Discretisation":
-        """The monotone chain that goes with the scheme."""
+        """The discretisation by the scheme's monotone chain."""
         return dataclasses.replace(self, scheme=self.scheme.chain)
 
     def at(self, t: Any) -> "Discretisation":
@@ -176,12 +175,12 @@ class Discretisation:
 
     @property
     def settled(self) -> "Discretisation":
-        """The discretisation for a program in which the grid does not change: see ``Grid.settled``."""
+        """The discretisation for a program in which the grid is constant, see ``Grid.settled``."""
         return altered(self, grid=self.grid.settled())
 
     @property
     def parts(self) -> Parts | None:
-        """The parts of the grid over the mesh; None for one device, and for grids too small for it, as coarser ones."""
+        """The parts of the grid over the mesh; None for one device, and for grids too small to divide."""
         parts = None if self.mesh is None else Parts(self.mesh, self.grid.shape)
         return parts if parts is not None and parts.fits else None
 
@@ -190,15 +189,15 @@ class Discretisation:
         return self.grid.components(self.dtype)
 
     def drift(self, u: list, d: list | None = None, x: list | None = None) -> list:
-        """The n components of f; at the nodes, or where ``x`` is."""
+        """The n components of f at the nodes, or at ``x``."""
         return list(components.components(self.problem.drift, *self._arguments(u, d, x), dtype=self.dtype))
 
     @property
     def apart(self) -> bool:
-        """Whether each player's drift is upwinded by itself: the scheme does, and they meet in a component.
+        """True if each player's drift is upwinded separately: the scheme has ``split``, and they share a component.
 
-        Then drift and cost must be sums of what each does, f = f(x, u, 0) + [f(x, 0, d) − f(x, 0, 0)]. At constrained
-        ends what is admissible depends on the sum.
+        Drift and cost must then be sums over the players, f = f(x, u, 0) + [f(x, 0, d) − f(x, 0, 0)]. At constrained
+        ends the admissible actions depend on the sum.
         """
         if not (self.scheme.split and self.problem.is_game) or self.grid.sides("constrained"):
             return False
@@ -206,49 +205,51 @@ class Discretisation:
         return found.separable and found.meet
 
     def drifts(self, u: list, d: list | None = None, x: list | None = None) -> list[list]:
-        """The drift in the parts that are upwinded each by itself: the whole, or what each player adds.
+        """The drift in the parts that are upwinded separately: the whole drift, or one part per player.
 
-        The noise goes with the first part; components that the disturbance does not drive are exactly zero in its own.
+        The noise goes with the first part. Components that the disturbance does not drive are exactly zero in the
+        second part.
         """
         if not self.apart:
             return [self.drift(u, d, x)]
         found = dependence.influence(self.problem, self.grid.ndim, self.dtype)
         driven, zero = found.drift.driven_by(found.disturbance), jnp.zeros((), self.dtype)
-        # at zero even where that is not admissible: a sum of two parts is told apart by any point
+        # at zero, even if it is not admissible: any point splits a sum of two functions
         no_u, no_d = ([zero] * len(inputs) for inputs in (found.control, found.disturbance))
         still, pushed = self.drift(no_u, no_d, x), self.drift(no_u, d, x)
-        # an exact zero, and not pushed − still = 1e-17, where the disturbance does not act: its sign would be upwinded
+        # an exact zero where the disturbance does not act, because upwinding depends on the sign of pushed − still =
+        # 1e-17
         theirs = [pushed[i] - still[i] if i in driven else zero for i in range(self.grid.ndim)]
         return [self.drift(u, no_d, x), theirs]
 
     def running_cost(self, u: list, d: list | None = None, x: list | None = None) -> Any:
-        """L, in cost per unit time; zero where the problem has none."""
+        """L, in cost per unit time; zero if the problem has no cost."""
         if self.problem.cost is None:
             return jnp.zeros((), self.dtype)
         return components.scalar(self.problem.cost, *self._arguments(u, d, x), dtype=self.dtype)
 
     def diffusion(self, u: list, d: list | None = None, x: list | None = None) -> dict[tuple[int, int], Any]:
-        """The entries a_ij, i ≤ j, of a = σσᵀ; those that are zero by construction are left out."""
+        """The entries a_ij, i ≤ j, of a = σσᵀ, without those that are zero by construction."""
         noise, n = self.problem.noise, self.grid.ndim
-        if noise is None:  # and no zeros: what is not there costs no pass over the nodes
+        if noise is None:  # an empty dict instead of zeros, which would cost a pass over the nodes
             return {}
         if callable(noise):
             sigma = components.components(noise, *self._arguments(u, d, x), dtype=self.dtype)
         else:
             places = self.coordinates() if x is None else x
             sigma = components.components(lambda x: jnp.asarray(noise, self.dtype), places, dtype=self.dtype)
-        if sigma.ndim < 2:  # one number, or one an axis: independent noise, a diagonal a
+        if sigma.ndim < 2:  # one number, or one per axis: independent noise, a diagonal a
             return {(i, i): s * s for i, s in enumerate(np.broadcast_to(sigma, (n,)))}
-        # σ of shape (n, k): a_ij = Σ_l σ_il σ_jl, of which the half i ≤ j says all
+        # σ of shape (n, k): a_ij = Σ_l σ_il σ_jl is symmetric, so i ≤ j suffices
         pairs = itertools.combinations_with_replacement(range(n), 2)
         return {(i, j): sum(p * q for p, q in zip(sigma[i], sigma[j], strict=True)) for i, j in pairs}
 
     def noisy_walls(self, x: list) -> list[dict[int, jax.Array]]:
-        """Where noise reflects, for every axis and the steps −1 and 1 that lead across its walls: bool, one slice each.
+        """The nodes where noise reflects, for every axis and the steps −1 and 1 across its walls: bool, one slice each.
 
-        There ∂V/∂n = 0, and slopes must see the mirror image. With the parabola through the last three nodes instead
-        the node beside a wall takes its slope from the node behind it, without a limit, while noise ties the value on
-        the wall to that node: under drift towards the wall with a < h f both grow like e^{.15 f t/h}.
+        There ∂V/∂n = 0, and slopes must use the mirror image. With the parabola through the last three nodes, the node
+        next to a wall would take its slope, unlimited, from the node behind it, while noise ties the value on the wall
+        to that node. Under drift towards the wall with a < h f both would grow like e^{0.15 f t/h}.
         """
         found: list[dict[int, jax.Array]] = [{} for _ in range(self.grid.ndim)]
         if self.problem.noise is None:
@@ -264,7 +265,7 @@ class Discretisation:
         return found
 
     def at_nodes(self, ingredient: Any) -> jax.Array:
-        """A function of the state alone, or a number, at every node, shape (*grid); None is zero."""
+        """A function of the state, or a number, at every node, shape (*grid); zero for None."""
         found = components.of_state(self.problem, ingredient, self.coordinates(), self.t, self.dtype)
         return jnp.broadcast_to(found, self.grid.shape)
 
@@ -273,25 +274,25 @@ class Discretisation:
 
 
 def over_nodes(task: T, shape: tuple[int, ...]) -> T:
-    """The leaves of a task, or of a march, with a value at every node, as truth values: those of this ``shape``."""
+    """Mark the leaves of a task, or of a march, that have a value at every node, that is, have this ``shape``."""
 
     def mark(leaf: Any) -> bool:
         return np.shape(leaf) == shape
 
     on = task.on
-    # without those of the problem and the grid, which may have the shape of the nodes by chance
+    # except the leaves of the problem and the grid, which may have this shape by chance
     nothing, cut = jax.tree.map(lambda _: False, on), jax.tree.map(mark, on.cut)
     return altered(jax.tree.map(mark, altered(task, on=None)), on=altered(nothing, cut=cut))
 
 
 def on_part(task: T, parts: Parts) -> T:
-    """A task, or a march, as one of the devices sees it, inside ``shard_map``."""
+    """A task, or a march, on the part of one device, inside ``shard_map``."""
     return altered(task, on=altered(task.on, grid=task.on.grid.divided(parts)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Differences:
-    """What a scheme makes slopes of: V at the nodes and how it changes from node to node.
+    """Input of ``Scheme.slopes``: V at the nodes and its differences between nodes.
 
     Attributes:
       on: the problem on its grid.
@@ -299,9 +300,9 @@ class Differences:
       value: V, (*grid).
       links: the distances to the neighbours along every axis.
       one_sided: D⁺ and D⁻ along every axis, each (*grid); zero across a wall.
-      lost: the nodes without a finite value, far above all others, bool (*grid); None where there is none.
-      first_order: true where the one-sided differences themselves are the slopes, a truth value that may be traced;
-        None: nowhere. Only schemes with ``blends`` read it, which saves them an array per slope.
+      lost: the unreachable nodes, whose stored value is far above all others, bool (*grid); None if there are none.
+      first_order: true where the slopes are the one-sided differences, a truth value that may be traced; None: nowhere.
+        Only schemes with ``blends`` read it, which saves an array per slope.
     """
 
     on: Discretisation

@@ -1,12 +1,13 @@
-"""The ends of the box: which drift leaves, and what that means for each kind of end.
+"""The ends of the box: the drift that leaves there, and its treatment at each kind of end.
 
-At a projected end the component of the drift that leaves is cut off, while the control keeps what it costs and earns.
-At a constrained end an action whose drift leaves costs infinitely much: for the control it is inadmissible, and a
-disturbance that can push the state out must be kept from it by the control. Noise reflects at both. At an open end
-nothing is stopped; see ``stencil`` for how the value goes on.
+At a projected end the outward component of the drift is cut off, while the control pays its full cost. At a constrained
+end an action whose drift leaves costs infinitely much: it is inadmissible for the control, and if a disturbance can
+push the state out the control must prevent this. Noise reflects at both. An open end stops nothing; see ``stencil`` for
+the extrapolation of the value.
 
-A drift that vanishes at an end does so up to rounding: of the parts that an action makes cancel at that node, and of
-the node's coordinates. What counts as leaving is held against these, so that it has no unit and knows no other place.
+A drift that vanishes at an end does so up to rounding, because terms of the drift cancel, and because the coordinates
+of the node are rounded. The threshold for leaving is relative to both errors at that node, so it does not depend on
+units or on the rest of the box.
 """
 
 import dataclasses
@@ -26,47 +27,47 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import Array, DType, Number, Numbers
 from hjbjax.tracing import components, dependence
 
-BLOCK = 2**18  # nodes at which the drift is evaluated at once, beyond which memory rules
-PLANES = 5  # coordinates of an axis at which the size of the drift is looked at, for the count of what is cut
-ROUNDINGS = 256  # units of eps in parts of a drift: what its formula may leave where they cancel
-COORDINATES = 8  # units of eps by which a coordinate may be off
+BLOCK = 2**18  # nodes per evaluation of the drift; limits the memory
+PLANES = 5  # coordinates per axis at which the size of the drift is sampled for the count
+ROUNDINGS = 256  # units of eps in terms of a drift: error of its formula if they cancel
+COORDINATES = 8  # rounding error of a coordinate, in units of eps
 
 
 @dataclasses.dataclass(frozen=True)
 class Rounding:
-    """Rounding of a drift component that vanishes at a node; both entries broadcast.
+    """Rounding errors of a drift component that vanishes at a node; both entries broadcast.
 
     Attributes:
-      idle: the component without actions: what the actions have to cancel.
-      shift: by how much it changes when the node moves by the rounding of its coordinates.
+      idle: the component without actions, which the actions may cancel.
+      shift: its change when the node moves by the rounding error of its coordinates.
     """
 
     idle: jax.Array
     shift: jax.Array
 
     def of(self, f: PerNode) -> jax.Array:
-        """The size of ``f`` below which it is rounding."""
+        """The size below which ``f`` counts as rounding."""
         eps = jnp.finfo(jnp.result_type(f)).eps
-        # |f₀| + |f − f₀| ≥ |f|, and much more where the parts cancel: a unit that shrinks with f would call
-        # every remainder of a cancellation a drift
+        # |f₀| + |f − f₀| ≥ |f|, and is much larger if the terms cancel; a threshold that shrinks with f would count
+        # every remainder of a cancellation as drift
         return ROUNDINGS * eps * (jnp.abs(self.idle) + jnp.abs(f - self.idle)) + self.shift
 
 
 def slack(on: Discretisation) -> list[Rounding]:
-    """The rounding of the drift along every axis, node by node."""
+    """The rounding errors of the drift along every axis, at every node."""
     problem, grid, dtype = on.problem, on.grid, on.dtype
     m, k = (0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances))
     nothing = ([jnp.zeros((), dtype)] * m, [jnp.zeros((), dtype)] * k)
     found = []
     for entry in on.drift(*nothing):
-        # zero need not be an admissible action: a formula without a value there leaves nothing to cancel
+        # zero need not be admissible: if the formula has no value there, nothing can cancel
         idle = jnp.broadcast_to(jnp.where(jnp.isfinite(entry), entry, 0), grid.shape)
         shift = jnp.zeros((), dtype)
         for axis in range(grid.ndim):
             up, down = (jnp.abs(slope) for slope in stencil.one_sided(idle, grid, axis))
             end = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)
             farthest = jnp.maximum(jnp.abs(grid.lo[axis]), jnp.abs(grid.hi[axis]))
-            slope = jnp.where(end, jnp.maximum(up, down), jnp.minimum(up, down))  # the lesser: not across a jump
+            slope = jnp.where(end, jnp.maximum(up, down), jnp.minimum(up, down))  # the other may cross a jump
             shift = shift + COORDINATES * jnp.finfo(dtype).eps * farthest * slope
         found.append(Rounding(idle, shift))
     return found
@@ -85,19 +86,19 @@ def barred(f: PerNode, grid: Grid, axis: int, rounding: Rounding, coarser: Numbe
 
 
 def beside(lost: jax.Array, grid: Grid) -> tuple[tuple[jax.Array, jax.Array], ...]:
-    """For every axis the nodes whose next one up, and whose next one down, is ``lost``, each bool (*grid)."""
+    """For every axis, the nodes whose upper neighbour, and those whose lower neighbour, is ``lost``, bool (*grid)."""
     up, down = ([stencil.unit(grid, axis, step) for axis in range(grid.ndim)] for step in (1, -1))
     pairs = zip(up, down, strict=True)
     return tuple((stencil.neighbour(lost, grid, p), stencil.neighbour(lost, grid, q)) for p, q in pairs)
 
 
 def strays(f: PerNode, beside: tuple[jax.Array, jax.Array], rounding: Rounding) -> jax.Array:
-    """The nodes where a drift component that is only rounding points to a lost node beside."""
+    """The nodes where a drift component that is only rounding points to a lost neighbour."""
     return _points(f, beside) & (jnp.abs(f) <= rounding.of(f))
 
 
 def leads(f: PerNode, beside: tuple[jax.Array, jax.Array], rounding: Rounding) -> jax.Array:
-    """The nodes where a drift component that is more than rounding points to a lost node beside."""
+    """The nodes where a drift component larger than rounding points to a lost neighbour."""
     return _points(f, beside) & (jnp.abs(f) > rounding.of(f))
 
 
@@ -107,12 +108,12 @@ def _points(f: PerNode, beside: tuple[jax.Array, jax.Array]) -> jax.Array:
 
 
 def inadmissible(on: Discretisation, u: list, d: list | None = None, *, eps: Number | None = None) -> jax.Array:
-    """The nodes at which these actions lead out across a constrained end, bool (*grid); ``eps`` is their rounding."""
+    """The nodes where the actions lead out across a constrained end, bool (*grid); ``eps`` is their precision."""
     bad = jnp.zeros(on.grid.shape, bool)
     if not on.grid.sides("constrained"):
         return bad
     f = on.drift(u, d)
-    # a policy found in single precision and looked at in double: its own rounding decides what leaves
+    # a policy found in single precision but evaluated in double is judged by its own precision
     coarser = 1 if eps is None else eps / jnp.finfo(on.dtype).eps
     for axis, rounding in enumerate(slack(on)):
         out = barred(f[axis], on.grid, axis, rounding, coarser)
@@ -123,25 +124,25 @@ def inadmissible(on: Discretisation, u: list, d: list | None = None, *, eps: Num
 def cut(
     problem: Problem, grid: Grid, value: np.ndarray, actions: tuple[list, list], acting: np.ndarray, t: Number = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Counts of nodes on each projected end: those where the drift under these actions is cut off, and all.
+    """The number of nodes on each projected end where these actions' drift is cut off, and of all nodes there.
 
-    Where the value does not change towards the end, next to its range over the box, and nobody's actions cost or earn
-    anything, the cut takes nothing away. Host level: one small program for the drift at the ends and on a coarse
-    sample, whose size tells what counts as leaving; counting is NumPy's, since reductions take long to compile.
+    If the value is constant towards the end, relative to its range over the box, and no action has a cost, the cut
+    changes nothing and is not counted. Host level: one small program evaluates the drift at the ends and on a coarse
+    sample, whose size sets the threshold. NumPy counts, because reductions compile slowly.
 
     Args:
-      problem, grid: the question.
+      problem, grid: the problem and its grid.
       value: V, shape (*grid).
       actions: u and d, each component (*grid).
-      acting: bool (*grid), the nodes that are looked at.
+      acting: bool (*grid), the nodes to check.
       t: the time.
 
     Returns:
-      Two arrays of integers of shape (n, 2), lower and upper ends; zeros where an end is not projected.
+      Two integer arrays of shape (n, 2), lower and upper ends; zeros at ends that are not projected.
     """
     counts, totals = np.zeros((2, grid.ndim, 2), int)
     acting, earning = np.broadcast_to(acting, grid.shape), _actions_cost(problem, grid.ndim, value.dtype)
-    # by their numbers in C order: a table of all numbers would take as much as the values
+    # by flat indices in C order, since a table of all indices would take as much memory as the values
     strides = [math.prod(grid.shape[axis + 1 :]) for axis in range(grid.ndim)]
     sides, sample = grid.sides("projected"), [np.linspace(0, n - 1, min(n, PLANES)).astype(int) for n in grid.shape]
 
@@ -159,14 +160,14 @@ def cut(
     parts = [functools.partial(_numbers, sample, strides), *(functools.partial(face, *side) for side in sides)]
     found = _in_blocks(drift, parts, math.prod(map(len, sample)) + sum(grid.size // grid.shape[a] for a, _ in sides))
     _, f = next(found)
-    # the sample tells the size of the drift over the box, next to which a remainder at an end may be rounding
+    # the sample gives the size of the drift over the box, relative to which a remainder at an end may be rounding
     least = ROUNDINGS * np.finfo(value.dtype).eps * np.max(np.abs(f), axis=1)
     ends = (np.max(value, where=acting, initial=-np.inf), np.min(value, where=acting, initial=np.inf))
     extent = ends[0] - ends[1] if acting.any() else 0.0
     for (axis, step), (there, f) in zip(sides, found, strict=True):
         # the slope at the end times the length of the axis, in the units of V
         change = np.abs(value.ravel()[there] - value.ravel()[there - step * strides[axis]]) * (grid.shape[axis] - 1)
-        # where V is flat towards the end but for rounding, the cut takes nothing from anybody
+        # if V is flat towards the end up to rounding, the cut does not matter
         matters = earning | (change > np.sqrt(np.finfo(value.dtype).eps) * extent)
         side, looked_at = (step + 1) // 2, acting.ravel()[there]  # column 0 is the lower end, 1 the upper
         counts[axis, side] = np.sum(looked_at & (step * f[axis] > least[axis]) & matters)
@@ -175,9 +176,9 @@ def cut(
 
 
 def count_leaving(on: Discretisation, value: jax.Array, u: list, d: list, acting: jax.Array) -> jax.Array:
-    """The nodes of each projected end where the drift under these actions is cut off, (n, 2); for use inside programs.
+    """The number of nodes on each projected end where these actions' drift is cut off, (n, 2); for compiled programs.
 
-    As ``cut`` counts them, but the sizes of the drift and of V are those at the end.
+    Like ``cut``, but scaled by the sizes of the drift and of V at the end.
     """
     grid, shape = on.grid, on.grid.shape
     f = [jnp.broadcast_to(entry, shape) for entry in on.drift(u, d)]
@@ -199,9 +200,9 @@ def count_leaving(on: Discretisation, value: jax.Array, u: list, d: list, acting
 def _in_blocks(
     drift: Callable[[np.ndarray], np.ndarray], parts: Sequence[Callable[[], np.ndarray]], count: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The numbers of the nodes of each part, and the drift there, (n, K); by one program, whatever the parts.
+    """The indices of the nodes of each part, and the drift there, (n, K); one program for all parts.
 
-    All of them at once where they are few, else by blocks of one size: in six dimensions most nodes lie on an end.
+    All parts at once if they are small, else blocks of one size: in six dimensions most nodes lie on an end.
     """
     if count <= BLOCK:
         numbers = [part() for part in parts]
@@ -218,14 +219,14 @@ def _in_blocks(
 
 
 def _numbers(picks: Sequence[np.ndarray], strides: Sequence[int]) -> np.ndarray:
-    """The numbers in C order of the nodes with one of some indices along each axis, flat."""
+    """The flat indices, in C order, of the nodes with one of the given indices along each axis."""
     along = (pick * stride for pick, stride in zip(picks, strides, strict=True))
     return functools.reduce(np.add.outer, along, np.zeros((), int)).ravel()
 
 
 @jax.jit
 def _drift(problem: Problem, x: list, u: list, d: list, t: Number) -> jax.Array:
-    """The drift at states (K,) an entry, shape (n, K)."""
+    """The drift at states with entries (K,), shape (n, K)."""
     f = components.components(problem.drift, *problem.arguments(x, u, d, t), dtype=x[0].dtype)
     return jnp.stack([jnp.broadcast_to(entry, x[0].shape) for entry in f])
 

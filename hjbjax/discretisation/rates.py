@@ -1,17 +1,19 @@
-"""The rates at which the Kushner–Dupuis Markov chain of a controlled diffusion jumps.
+"""The jump rates of the Kushner–Dupuis Markov chain of a controlled diffusion.
 
 On axis i with spacing h (h⁺ up, h⁻ down), drift f_i and diffusion a = σσᵀ the chain leaves a node at the rates
 
     c_i^+ = (e_i + h⁻ f_i) / (h⁺ (h⁺ + h⁻)),     c_i^- = (e_i − h⁺ f_i) / (h⁻ (h⁺ + h⁻))
 
-with e_i = a_ii + h⁺ f_i⁺ + h⁻ f_i⁻ for the plain upwind chain, so that on a uniform grid
-c_i^± = f_i^±/h + a_ii/(2h²), and with e_i = max(a_ii, h⁺ f_i, −h⁻ f_i) where central differences are allowed as
-far as they stay monotone. Correlated noise moves along diagonals: a pair i, j gives
-c^{±(e_i + e_j)} = a_ij⁺/(2 h_i h_j), c^{±(e_i − e_j)} = a_ij⁻/(2 h_i h_j), and takes |a_ij| h_i/h_j from a_ii.
+with e_i = a_ii + h⁺ f_i⁺ + h⁻ f_i⁻ for the plain upwind chain, which gives c_i^± = f_i^±/h + a_ii/(2h²) on a uniform
+grid. With central differences wherever they are monotone, e_i = max(a_ii, h⁺ f_i, −h⁻ f_i). Correlated noise jumps
+along
+diagonals: a pair i, j gives c^{±(e_i + e_j)} = a_ij⁺/(2 h_i h_j), c^{±(e_i − e_j)} = a_ij⁻/(2 h_i h_j), and takes
+|a_ij| h_i/h_j from a_ii.
 
-Q = Σ c, Δt = 1/max_u Q, the transition probabilities are c Δt, and the self-transition is 1 − Q Δt (the chapter
-prints (13.3) without the "1 −"). At a wall drift that points out of the box is cut off and noise reflects on the node:
-inwards at (e(n⁺) − h n)/h², n the drift outwards, see ``schemes``; a diagonal jump across goes to its mirror image.
+With Q = Σ c and Δt = 1/max_u Q, the transition probabilities are c Δt, and the self-transition is 1 − Q Δt (the chapter
+prints (13.3) without the "1 −"). At a wall, outward drift is cut off and noise reflects on the node: the chain moves
+inwards at the rate (e(n⁺) − h n)/h², with n the outward drift, see ``schemes``. A diagonal jump across a wall goes to
+its mirror image.
 Source: H. J. Kushner and P. Dupuis, Numerical Methods for Stochastic Control Problems in Continuous Time.
 """
 
@@ -36,12 +38,12 @@ Offset = tuple[int, ...]
 
 @pytree_dataclass(static=("offsets", "one_way"))
 class Rates:
-    """The generator of the chain under one policy, matrix-free: (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)).
+    """The matrix-free generator of the chain under a policy: (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)).
 
     Args:
-      offsets: the jumps o, each a tuple of −1, 0, 1, one entry an axis.
+      offsets: the jumps o, each a tuple of −1, 0, 1, one entry per axis.
       values: for each offset the rates c_o ≥ 0 per unit time, shape (*grid); none leads out of the box.
-      one_way: whether of two opposite jumps at most one has a positive rate, as without noise.
+      one_way: True if at most one of two opposite jumps has a positive rate, as without noise.
     """
 
     offsets: tuple[Offset, ...]
@@ -50,12 +52,12 @@ class Rates:
 
     def total(self) -> Any:
         """Q = Σ_o c_o, the rate at which the chain leaves each node, shape (*grid)."""
-        return sum(self.values[1:], start=self.values[0])  # no 0 to start from, which would be one more array
+        return sum(self.values[1:], start=self.values[0])  # start=0 would cost one more array
 
     def apply(self, grid: Grid, values: jax.Array) -> jax.Array:
         """𝓛V for node values V, shape (*grid); cost per unit time."""
         jumps = zip(self.offsets, self.values, strict=True)
-        # differences first: c V(x + o) and c V(x) are both large where h is small, and their difference is not
+        # differences first: c V(x + o) and c V(x) are both large for small h, while their difference is not
         terms = [c * (stencil.continued(values, grid, offset) - values) for offset, c in jumps]
         return sum(terms[1:], start=terms[0])
 
@@ -64,7 +66,7 @@ class Rates:
         return dataclasses.replace(self, values=tuple(factor * c for c in self.values))
 
     def inflow(self, grid: Grid) -> "Rates":
-        """The off-diagonal part of the transposed generator: what flows into x from x + o, as rates."""
+        """The off-diagonal part of the transposed generator, as rates from x + o into x."""
         opposite = [tuple(-step for step in offset) for offset in self.offsets]
         arriving = [
             stencil.neighbour(c, grid, offset, ghost=False) for offset, c in zip(opposite, self.values, strict=True)
@@ -73,18 +75,18 @@ class Rates:
 
 
 def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
-    """The jump rates under a policy of the monotone chain that goes with the scheme.
+    """The jump rates under a policy of the scheme's monotone chain.
 
     Args:
-      on: the chain; of its problem only drift and noise matter.
-      u: the m components of the control, each of a shape that broadcasts to (*grid).
-      d: likewise of the disturbance, in a game.
+      on: the discretisation; only drift and noise of its problem are used.
+      u: the m components of the control, each broadcasting to (*grid).
+      d: the components of the disturbance, in a game.
     """
     grid = on.grid
-    x, u, d = tie((on.coordinates(), u, d))  # or loops keep drift that u does not move
+    x, u, d = tie((on.coordinates(), u, d))  # otherwise loops keep drift that u does not change
     first, *others = on.drifts(u, d, x)
     table = _table(on, first, on.diffusion(u, d, x))
-    for other in others:  # jumps of one chain or of the other
+    for other in others:  # jumps of either chain
         for offset, rate in _table(on, other, {}).items():
             table[offset] = table[offset] + rate
     values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
@@ -92,7 +94,7 @@ def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
 
 
 def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[Offset, Any]:
-    """The rate of every jump for a drift f and a diffusion a."""
+    """The rate of every jump for drift f and diffusion a."""
     grid = on.grid
     table: dict[Offset, Any] = {}
     for axis, link in enumerate(links(on.chain)):
@@ -110,9 +112,9 @@ def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[O
 
 
 def _reflect(table: dict[Offset, Any], grid: Grid, axis: int, step: int, *, noisy: bool) -> None:
-    """Jumps beyond an end with a prescribed slope go to the mirror image, the node inside; drift alone stays.
+    """Redirect jumps beyond an end with a prescribed slope to the mirror image inside; without noise drop them.
 
-    The slope is a payment, which is no part of the rates.
+    The prescribed slope acts as a payment, which is not part of the rates.
     """
     outwards, inwards = (stencil.unit(grid, axis, sign * step) for sign in (1, -1))
     beyond = stencil.on_edge(grid, axis, step)
@@ -125,11 +127,12 @@ def _reflect(table: dict[Offset, Any], grid: Grid, axis: int, step: int, *, nois
 def fastest_rate(on: Discretisation) -> jax.Array:
     """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
 
-    Q is convex in u for a drift affine in u, so that corners of the sets suffice; samples are added for others.
+    If the drift is affine in u, Q is convex in u, so the corners of the sets suffice; samples are added for other
+    drifts.
     """
     result = jnp.zeros(on.grid.shape, on.dtype)
     us, ds = (list(sets.probes(each, on.dtype)) for each in (on.problem.controls, on.problem.disturbances))
-    if on.apart:  # Q is a sum of what each player adds: pairs of probes would take twice the time to compile
+    if on.apart:  # Q is a sum over the players; pairs of probes would double the compile time
         mine = (_table(on, on.drifts(u, ds[0])[0], on.diffusion(u, ds[0])) for u in us)
         theirs = (_table(on, on.drifts(us[0], d)[1], {}) for d in ds)
         tables = ([sum(table.values()) for table in each] for each in (mine, theirs))
@@ -140,7 +143,7 @@ def fastest_rate(on: Discretisation) -> jax.Array:
 
 
 def largest_rate(on: Discretisation) -> jax.Array:
-    """max over the actions and the nodes of Q, a number, without an array of the nodes."""
+    """max of Q over actions and nodes, a number, without an array of the nodes."""
     pairs = list(
         itertools.product(*(sets.probes(each, on.dtype) for each in (on.problem.controls, on.problem.disturbances)))
     )
@@ -149,7 +152,7 @@ def largest_rate(on: Discretisation) -> jax.Array:
     us, ds = ([jnp.stack(list(entries)) for entries in zip(*each, strict=True)] for each in zip(*pairs, strict=True))
 
     def larger(k: Any, largest: jax.Array) -> jax.Array:
-        # one action at a time: of all at once XLA keeps what they share, 17 arrays for a quadrotor in six dimensions
+        # one action at a time: for all at once XLA keeps common terms, 17 arrays for a quadrotor in six dimensions
         u, d = ([entry[k] for entry in entries] for entries in (us, ds))
         return jnp.maximum(largest, on.grid.largest(jump_rates(on, u, d).total()))
 
@@ -157,19 +160,19 @@ def largest_rate(on: Discretisation) -> jax.Array:
 
 
 def _reflecting(grid: Grid, axis: int, step: int) -> Array:
-    """The nodes at an end beyond which a diagonal jump lands on the mirror image."""
+    """The nodes at an end where a diagonal jump lands on the mirror image."""
     return (
         stencil.on_edge(grid, axis, step) if (axis, step) not in grid.sides("open") else stencil.wall(grid, axis, step)
     )
 
 
 def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
-    """A diagonal jump that would leave the box goes to the mirror image of its end: noise reflects."""
+    """Add the diagonal jumps of a pair of axes; those that leave the box go to the mirror image (noise reflects)."""
     scale = 2 * grid.spacing(i) * grid.spacing(j)
     pairs = list(itertools.product((1, -1), repeat=2))
     # a_ij⁺ along the diagonal, a_ij⁻ across it
     rate = {(p, q): jnp.maximum(entry * (p * q), 0) / scale for p, q in pairs}
-    for p, q in pairs:  # first across the walls of axis i, then, at a corner once more, across those of axis j
+    for p, q in pairs:  # first across the walls of axis i, then of axis j; both at a corner
         off = _reflecting(grid, i, p)
         rate[-p, q], rate[p, q] = rate[-p, q] + jnp.where(off, rate[p, q], 0), jnp.where(off, 0, rate[p, q])
     for p, q in pairs:

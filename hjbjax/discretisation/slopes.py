@@ -1,6 +1,6 @@
 """One-sided slopes of order 2 and 5 on equal spacings: ENO and WENO.
 
-With the differences D to both sides of a node and their differences s, second order takes the smoother stencil,
+With the differences D on both sides of a node and their differences s, second order uses the smoother stencil,
 
     P⁺ = D⁺ − ½ m(s_i, s_{i+1}),    P⁻ = D⁻ + ½ m(s_i, s_{i−1}),    m(a, b) = a if |a| < |b| else b.
 
@@ -11,10 +11,10 @@ p, q, r, s, the slope from below is
 
     S₀ = 13/12 (q − p)² + ¼ (3q − p)²,  S₁ = 13/12 (r − q)² + ¼ (q + r)²,  S₂ = 13/12 (s − r)² + ¼ (s − 3r)²,
 
-c = (.1, .6, .3); the slope from above is its mirror image. At a kink the order is that of the best of three stencils
-of order 3. These slopes are scaled by the range of V over the width of the box, so that ε = 10⁻⁶ has no unit. Beyond
-an end the value is continued quadratically, or by its mirror image where noise reflects; across a wall the slope is
-zero, as in every scheme here. The terms stand so that XLA makes one loop of them and keeps no array beside the result.
+c = (0.1, 0.6, 0.3); the slope from above is its mirror image. At a kink the slope is as accurate as the best of three
+third-order stencils. The slopes in S_k are scaled by the range of V over the width of the box, so ε = 10⁻⁶ has no unit.
+Beyond an end the value is extrapolated quadratically, or mirrored where noise reflects; across a wall the slope is
+zero, as in every scheme here. The terms are ordered so that XLA fuses them into one loop without temporary arrays.
 Source: G.-S. Jiang and D. Peng, Weighted ENO schemes for Hamilton–Jacobi equations, SIAM J. Sci. Comput. 21.
 """
 
@@ -31,8 +31,8 @@ from hjbjax.discretisation.stencil import Links, PerNode
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Array, AtNodes, Field, Mask
 
-Noisy: TypeAlias = Sequence[Mapping[int, Array]]  # an axis each: at which walls noise reflects, see ``Discretisation``
-EPSILON = 1e-6  # of a squared slope over the typical one: what counts as equally smooth
+Noisy: TypeAlias = Sequence[Mapping[int, Array]]  # per axis: walls where noise reflects, see ``Discretisation``
+EPSILON = 1e-6  # relative to the typical squared slope: differences in smoothness below it are ignored
 
 
 def eno2(values: Field, grid: Grid, noisy: Noisy | None = None) -> list[tuple[Field, Field]]:
@@ -45,8 +45,8 @@ def of_second_order(
 ) -> tuple[Field, Field]:
     """D⁺ − (h/2) m(s_i, s_{i+1}) and D⁻ + (h/2) m(s_i, s_{i−1}) for a mean m of second differences; zero across a wall.
 
-    On equal spacings, with at least three nodes. Beyond an end the second difference is continued as a constant, or by
-    its mirror image where noise reflects.
+    Requires equal spacings and at least three nodes. Beyond an end the second difference is extrapolated as a constant,
+    or mirrored where noise reflects.
     """
     far_down, down, up, far_up = _differences(values, grid, axis, 2, 1 / grid.spacing(axis), noisy)
     bend = up - down  # h V'': half of it is h/2 V'', the leading error of a one-sided difference
@@ -57,10 +57,10 @@ def of_second_order(
 def weno5(values: Field, grid: Grid, lost: Mask | None = None, noisy: Noisy | None = None) -> list[tuple[Field, Field]]:
     """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall.
 
-    Values at the nodes that are ``lost`` are no values and set no unit.
+    Values at ``lost`` nodes are ignored in the scaling.
     """
     most, least = (values, values) if lost is None else (jnp.where(lost, fill, values) for fill in (-jnp.inf, jnp.inf))
-    # it only sets the unit of ε: no derivative goes through the nodes of the largest and the least V
+    # it only sets the unit of ε, so no derivative should pass through the nodes of the largest and the least V
     extent = jax.lax.stop_gradient(grid.largest(most) - grid.least(least))
     extent = jnp.where(extent > 0, extent, 1)  # a constant V has slopes zero in any unit
     result = []
@@ -74,7 +74,7 @@ def weno5(values: Field, grid: Grid, lost: Mask | None = None, noisy: Noisy | No
 
 
 def broken(link: Links, grid: Grid, axis: int, lost: Mask | None = None) -> AtNodes | None:
-    """The nodes whose seven values along an axis are not of one piece: some lie in a target, or are ``lost``."""
+    """The nodes whose seven values along an axis are not smooth together: some are in a target or ``lost``."""
     found = None if lost is None else _spread(jnp.asarray(lost), grid, axis, 3)
     if link.meets_up is None or link.meets_down is None:
         return found
@@ -83,7 +83,7 @@ def broken(link: Links, grid: Grid, axis: int, lost: Mask | None = None) -> AtNo
 
 
 def _spread(mask: AtNodes, grid: Grid, axis: int, reach: int) -> AtNodes:
-    """The nodes at most ``reach`` away along an axis from one of a mask."""
+    """The nodes within ``reach`` of a mask along an axis."""
     for _ in range(reach):
         up, down = (stencil.neighbour(mask, grid, stencil.unit(grid, axis, step)) for step in (1, -1))
         mask = mask | up | down
@@ -91,13 +91,13 @@ def _spread(mask: AtNodes, grid: Grid, axis: int, reach: int) -> AtNodes:
 
 
 def _smaller(a: Field, b: Field) -> Field:
-    """m(a, b): of two second differences the smaller in size, which belongs to the smoother stencil."""
+    """m(a, b): the smaller of two second differences in size, which belongs to the smoother stencil."""
     return jnp.where(jnp.abs(a) < jnp.abs(b), a, b)
 
 
 def _differences(values: Field, grid: Grid, axis: int, reach: int, scale: PerNode, noisy: Noisy | None) -> list[Field]:
     """The differences between neighbours times ``scale``, from ``reach`` nodes below a node to ``reach`` above."""
-    # kept apart: fused into the loop over the nodes, the ends would be branches in it
+    # the barrier prevents fusion into the loop over the nodes, where the ends would become branches
     wide, count = jax.lax.optimization_barrier(_continued(values, grid, axis, reach, noisy)), grid.shape[axis]
     nodes = [jax.lax.slice_in_dim(wide, k, k + count, axis=axis) for k in range(2 * reach + 1)]
     return [(right - left) * scale for left, right in itertools.pairwise(nodes)]
@@ -107,13 +107,13 @@ def _continued(values: Field, grid: Grid, axis: int, reach: int, noisy: Noisy | 
     """``values`` with ``reach`` more entries at both ends of an axis."""
 
     def ended(step: int) -> jax.Array:
-        """The parabola through the last three entries of an end, at the nearest ``reach`` places beyond it.
+        """The ``reach`` nearest entries beyond an end, from the parabola through its last three entries.
 
-        Where noise reflects, the mirror image.
+        Where noise reflects they are the mirror image.
         """
         a, b, c, *far = (stencil.slices(values, grid, axis, step, k) for k in range(max(3, reach + 1)))
         along = [-1 if i == axis else 1 for i in range(grid.ndim)]
-        # Lagrange's polynomials on the places 0, 1, 2, at −3, −2 and −1; at the upper end the mirror image
+        # Lagrange polynomials on the points 0, 1, 2, evaluated at −3, −2 and −1; the upper end is the mirror image
         weights = np.array([[10, -15, 6], [6, -8, 3], [3, -3, 1]])[3 - reach :][::-step].T.astype(values.dtype)
         first, second, third = (w.reshape(along) * node for w, node in zip(weights, (a, b, c), strict=True))
         found = first + second + third
@@ -131,11 +131,11 @@ def _continued(values: Field, grid: Grid, axis: int, reach: int, noisy: Noisy | 
 
 
 def _weighted(a: Field, b: Field, c: Field, d: Field, e: Field) -> Field:
-    """The weighted slope between c and d from five differences in order, upwind first."""
+    """The weighted slope between c and d from five differences in upwind order."""
     p, q, r, s = b - a, c - b, d - c, e - d
     first = (13 / 12 * (q - p) ** 2 + (3 * q - p) ** 2 / 4 + EPSILON) ** 2
     middle = (13 / 12 * (r - q) ** 2 + (q + r) ** 2 / 4 + EPSILON) ** 2
     last = (13 / 12 * (s - r) ** 2 + (s - 3 * r) ** 2 / 4 + EPSILON) ** 2
-    # c_k/(ε + S_k)² over one common denominator, so that a slope takes one quotient and not four
+    # c_k/(ε + S_k)² over one common denominator, so a slope takes one division instead of four
     w0, w1, w2 = 0.1 * (middle * last), 0.6 * (first * last), 0.3 * (first * middle)
     return c + (w0 * (5 * q - 2 * p) + w1 * (2 * r + q) + w2 * (4 * r - s)) / (6 * (w0 + w1 + w2))

@@ -1,13 +1,13 @@
 """Neighbours and one-sided differences on a grid, with ghost cells.
 
-An edge that is neither periodic nor open is a wall on its node. Drift sees a copy of the node beyond it, a one-sided
-difference of zero, which projects outward drift back onto the box. Noise sees the mirror image, V_{N+1} = V_{N−1}: the
-reflected path has ∂V/∂n = 0 there, and a value that is even about the wall has it to second order, where the copy
-puts the wall half a spacing further out. Beyond an open end the value goes on as the parabola through its last three
-nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} where they are equally spaced.
+An edge that is neither periodic nor open is a wall on its node. For drift, the value beyond is a copy of the node, so
+the one-sided difference is zero and outward drift is projected onto the box. For noise it is the mirror image,
+V_{N+1} = V_{N−1}: a reflected path has ∂V/∂n = 0 there, which an even extension satisfies to second order, while the
+copy would move the wall outwards by half a spacing. Beyond an open end the value is extrapolated by the parabola
+through the last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} for equal spacings.
 
-Where the nodes are divided over many devices, what stands beyond the last node of a part is fetched from the part
-beside: see ``problem.parts``.
+If the nodes are divided among several devices, the values beyond the last node of a part are fetched from the adjacent
+part: see ``problem.parts``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,41 +24,41 @@ from hjbjax.problem.types import Array, AtNodes, Field, Number, Scalar
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-PerNode: TypeAlias = float | jax.Array | np.ndarray  # a number a node, as one number or as an array that broadcasts
+PerNode: TypeAlias = float | jax.Array | np.ndarray  # one number per node, as a scalar or an array that broadcasts
 
-LONGER = 4  # axes up to which neighbours along the last one are slices of a longer array
+LONGER = 4  # number of axes up to which neighbours along the last one are slices of a longer array
 
 
 def on_edge(grid: Grid, axis: int, step: int) -> Array:
     """The nodes without a neighbour in direction ``step`` along ``axis``, bool; broadcasts against the node axes."""
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
-    # which nodes are here, only the running program knows
+    # the nodes on this device are known at run time only
     if grid.parts is not None and (grid.is_divided(axis) or not grid.parts.even(axis)):
         ended = jnp.asarray(not grid.periodic[axis])
         return (grid.parts.last(axis, step) & ended).reshape(along)
-    # (1, …, N, …, 1) and on the host: as a constant of the size of the grid it would stand in every program
+    # (1, …, N, …, 1) and on the host: a constant of the size of the grid would be stored in every program
     mask = np.zeros(grid.shape[axis], dtype=bool)
     mask[-1 if step > 0 else 0] = not grid.periodic[axis]
     return mask.reshape(along)
 
 
 def has_walls(grid: Grid, axis: int) -> bool:
-    """True if an end of an axis, or both, stops drift and noise."""
+    """True if at least one end of an axis stops drift and noise."""
     return not grid.periodic[axis] and any(has_wall(grid, axis, step) for step in (-1, 1))
 
 
 def has_wall(grid: Grid, axis: int, step: int) -> bool:
-    """True if an end stops drift and noise; False where V continues: at open ends and where its slope is prescribed."""
+    """True if an end stops drift and noise; False at open ends and where the slope is prescribed, as V continues."""
     return (axis, step) not in grid.sides("open") and (axis, step) not in grid.sides("neumann")
 
 
 def sloped(grid: Grid, axis: int, step: int) -> Any:
-    """The prescription of a slope at an end, with its arrays; None where the slope is not prescribed."""
+    """The prescribed slope at an end, with its arrays; None if the slope is not prescribed."""
     return next((end for i, s, end in grid.prescribed("neumann", "robin") if (i, s) == (axis, step)), None)
 
 
 def wall(grid: Grid, axis: int, step: int) -> Array:
-    """The nodes at which drift and noise in direction ``step`` along ``axis`` are stopped: edges that are not open."""
+    """The nodes at which drift and noise in direction ``step`` along ``axis`` stop: edges that are not open."""
     edge = on_edge(grid, axis, step)
     return np.zeros(edge.shape, bool) if not has_wall(grid, axis, step) else edge
 
@@ -69,22 +69,22 @@ def walls(grid: Grid, axis: int) -> Array:
 
 
 def stopped(up: Field, down: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
-    """Slopes of a scheme from above and from below along one axis, with those across walls made zero."""
+    """Set slopes from above and from below along one axis to zero across walls."""
     return jnp.where(wall(grid, axis, 1), 0, up), jnp.where(wall(grid, axis, -1), 0, down)
 
 
 def bends(up: Field, down: Field, grid: Grid, axis: int) -> Field:
-    """D⁺ − D⁻, which noise sees: across a wall stands the mirror image, −D⁻ for D⁺ and −D⁺ for D⁻."""
+    """D⁺ − D⁻ for noise: across a wall D⁺ is the mirror image −D⁻, and D⁻ is −D⁺."""
     bend = up - down
     return jnp.where(walls(grid, axis), 2 * bend, bend)  # one of the two is zero there
 
 
 def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
-    """The weights of the last node and of the nodes before it in the value beyond an end; their sum is one.
+    """The weights of the last node and of the nodes before it in the value beyond an end.
 
-    Two weights of a straight line at a linear end, three of a parabola at an open one. The gap beyond the end has the
-    length of the last gap inside. Where a slope s + r V is prescribed, V continues as the mirror image with that slope,
-    V_{N+1} = V_{N−1} ± 2h (s + r V_N), whose weights are ±2h r and 1.
+    They sum to one at a linear end (two weights of a line) and at an open end (three weights of a parabola). The gap
+    beyond the end equals the last gap inside. Where a slope s + r V is prescribed, V continues as the mirror image with
+    that slope, V_{N+1} = V_{N−1} ± 2h (s + r V_N), with the weights ±2h r and 1.
     """
     if (axis, step) in grid.sides("linear"):
         return 2.0, -1.0
@@ -94,7 +94,7 @@ def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
         return 3.0, -3.0, 1.0
     gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
     last, before = (gaps[-1], gaps[-2]) if step > 0 else (gaps[0], gaps[1])
-    # Newton's form of the parabola at a distance ``last`` beyond the end; equal gaps make it 3, −3, 1
+    # Newton's form of the parabola at a distance ``last`` beyond the end; equal gaps give 3, −3, 1
     ratio, bend = last / before, 2 * last / (last + before)
     return 2 + bend, -(1 + bend + bend * ratio), bend * ratio
 
@@ -110,18 +110,18 @@ def _last_gap(grid: Grid, axis: int, step: int) -> Number:
 def continued(
     values: Field, grid: Grid, offset: tuple[int, ...], *, mirror: bool = False, change: bool = False
 ) -> Field:
-    """V at x + offset for every node x, shape (*grid): beyond ends where V continues its continuation.
+    """V at x + offset for every node x, shape (*grid), extrapolated beyond ends where V continues.
 
     Args:
       values: V, or a change of V.
-      grid: the nodes.
+      grid: the grid.
       offset: one step −1, 0 or 1 per axis.
-      mirror: beyond a wall take the mirror image, which noise sees; otherwise as in ``neighbour``.
-      change: ``values`` are a change of V, to which a prescribed slope adds nothing.
+      mirror: beyond a wall use the mirror image, as noise requires; otherwise as in ``neighbour``.
+      change: ``values`` are a change of V, so a prescribed slope adds nothing.
     """
     if not (grid.sides("open") or grid.sides("neumann") or mirror):
         return neighbour(values, grid, offset)
-    for axis, step in enumerate(offset):  # beyond a corner: what one axis says through what the other says
+    for axis, step in enumerate(offset):  # beyond a corner the axes compose
         moved = neighbour(values, grid, unit(grid, axis, step))
         if step and not grid.periodic[axis] and not has_wall(grid, axis, step):
             moved = jnp.where(on_edge(grid, axis, step), _ended(values, grid, axis, step, change=change), moved)
@@ -134,12 +134,12 @@ def continued(
 def inward(
     offsets: Sequence[tuple[int, ...]], values: Sequence[jax.Array], grid: Grid
 ) -> tuple[list[tuple[int, ...]], list[jax.Array]]:
-    """Offsets and entries of an operator with those beyond open ends moved to the nodes of the parabola inside.
+    """Offsets and entries of an operator, with those beyond open ends moved to the inner nodes of the parabola.
 
-    Row sums stay, since the weights of a parabola sum to one. Offsets may come twice; their entries add up.
+    Row sums are preserved, since the weights of a parabola sum to one. Repeated offsets add up.
     """
     pairs = list(zip(offsets, values, strict=True))
-    for axis in range(grid.ndim):  # one after the other: a diagonal jump over a corner is turned inwards twice
+    for axis in range(grid.ndim):  # one after the other: a diagonal jump over a corner is moved twice
         kept = []
         for offset, value in pairs:
             step = offset[axis]
@@ -149,17 +149,17 @@ def inward(
             outside = on_edge(grid, axis, step)
             kept.append((offset, jnp.where(outside, 0, value)))
             for k, weight in enumerate(continuation(grid, axis, step)):
-                place = (*offset[:axis], -k * step, *offset[axis + 1 :])  # the end itself, one before it, two
+                place = (*offset[:axis], -k * step, *offset[axis + 1 :])  # the end itself, one before it, two before it
                 kept.append((place, jnp.where(outside, jnp.asarray(weight, value.dtype) * value, 0)))
         pairs = kept
     return [offset for offset, _ in pairs], [value for _, value in pairs]
 
 
 def slices(values: jax.Array, grid: Grid, axis: int, step: int, inwards: int = 0, count: int = 1) -> jax.Array:
-    """So many slices of the nodes next to the end of an axis in direction ``step``, ``inwards`` away from it.
+    """``count`` slices of nodes next to the end of an axis in direction ``step``, ``inwards`` away from the end.
 
-    Of an array at the nodes, or of one that varies along this axis and broadcasts. In the order of the nodes. Where
-    the axis is divided they are next to the end of this part.
+    The array has values at the nodes, or varies along this axis and broadcasts. Slices are in the order of the nodes.
+    On a divided axis they are next to the end of the local part.
     """
     first: int | Scalar = inwards
     if step > 0:
@@ -171,7 +171,7 @@ def slices(values: jax.Array, grid: Grid, axis: int, step: int, inwards: int = 0
 
 
 def joined(values: AtNodes, grid: Grid, axis: int, below: jax.Array, above: jax.Array) -> jax.Array:
-    """The values with slices ``below`` and ``above`` them along an axis, these behind the last node that is here."""
+    """The values with the slices ``below`` and ``above`` joined along an axis, the latter after the last local node."""
     long = jnp.concatenate([below, values, above], axis=axis)
     if grid.parts is None or grid.parts.even(axis):
         return long
@@ -179,14 +179,14 @@ def joined(values: AtNodes, grid: Grid, axis: int, below: jax.Array, above: jax.
 
 
 def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) -> jax.Array:
-    """The slices beyond the last node here: of the part beside, of the other end of a periodic axis, or ``ended``.
+    """The slices beyond the last local node: of the adjacent part, of the other end of a periodic axis, or ``ended``.
 
-    ``ended`` is what stands beyond an end of the box, and says how many slices there are to be.
+    ``ended`` contains the values beyond an end of the box, and determines the number of slices.
     """
     cyclic = bool(grid.periodic[axis])
     if not (cyclic or grid.is_divided(axis)):
         return ended
-    # what the other side has at the end that faces this one
+    # the slices of the other side at the end that faces this one
     given = slices(values, grid, axis, -step, count=ended.shape[axis])
     if grid.parts is None or not grid.is_divided(axis):
         return given
@@ -195,7 +195,7 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
 
 
 def _ended(values: AtNodes, grid: Grid, axis: int, step: int, *, change: bool = False) -> jax.Array:
-    """The values beyond the end of an ordinary axis, one slice: a copy of the end node, or V continued from inside."""
+    """The values beyond an end of an axis that is not periodic, one slice: a copy of the end node, or extrapolated."""
     if has_wall(grid, axis, step):
         return slices(values, grid, axis, step)
     weights = [jnp.asarray(weight, values.dtype) for weight in continuation(grid, axis, step)]
@@ -210,9 +210,9 @@ def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bo
 
     Args:
       values: node values, shape (*grid).
-      grid: the grid they live on.
+      grid: the grid.
       offset: steps along the axes, each −1, 0 or 1.
-      ghost: beyond an edge take the edge node's own value; otherwise zero.
+      ghost: beyond an edge use the edge node's value; otherwise zero.
     """
     for axis, step in enumerate(offset):
         if step == 0:
@@ -223,9 +223,9 @@ def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bo
             parts = [outside, jax.lax.slice_in_dim(values, 0, grid.shape[axis] - 1, axis=axis)]
         else:
             parts = [jax.lax.slice_in_dim(values, 1, grid.shape[axis], axis=axis), outside]
-        moved = jnp.concatenate(parts, axis=axis)  # fused, where a pad would fill an array
+        moved = jnp.concatenate(parts, axis=axis)  # fused, while a pad would fill an array
         if step > 0 and grid.parts is not None and not grid.parts.even(axis):
-            # the last entry may be no node of this part, and the one before it the last
+            # the last entry may be padding of this part, and the one before it the last node
             place = jnp.arange(grid.shape[axis]).reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
             moved = jnp.where(place == grid.parts.count(axis) - 1, outside, moved)
         values = moved
@@ -243,8 +243,9 @@ class Links:
 
     Attributes:
       up, down: the distances.
-      meets_up, meets_down: where the link ends on the boundary of a target before it comes to the next node, and
-        the value there; None where no link does.
+      meets_up, meets_down: the nodes where the link ends on the boundary of a target before the next node, and the
+      value
+        there; None if no link does.
     """
 
     up: PerNode
@@ -254,12 +255,12 @@ class Links:
 
 
 def links(grid: Grid, axis: int) -> Links:
-    """The links of the grid itself along one axis; on a stretched one an end repeats its only distance."""
+    """The links of the grid along one axis; on a stretched axis an end node repeats its only distance."""
     if grid.stretch[axis] is None:
         return Links(grid.spacing(axis), grid.spacing(axis))
     gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
-    # N − 1 gaps for N nodes: beyond an end stands the mirror image, or a parabola over a gap as long
+    # N − 1 gaps for N nodes: beyond an end is the mirror image, or a parabola over a gap of the same length
     up, down = jnp.append(gaps, gaps[-1:]), jnp.append(gaps[:1], gaps)
     if grid.parts is not None:
         up, down = grid.parts.own(up, axis), grid.parts.own(down, axis)
@@ -270,7 +271,7 @@ def one_sided(values: Field, grid: Grid, axis: int, link: Links | None = None) -
     """The differences D⁺ = (V(x+h⁺) − V(x))/h⁺ and D⁻ = (V(x) − V(x−h⁻))/h⁻ along one axis; zero across a wall."""
     link = link or links(grid, axis)
     up, down = _neighbours(values, grid, axis)
-    if link.meets_up is not None:  # the link ends on a target: the exit cost there takes the neighbour's place
+    if link.meets_up is not None:  # the link ends on a target: its exit cost replaces the neighbour's value
         up = jnp.where(*link.meets_up, up)
     if link.meets_down is not None:
         down = jnp.where(*link.meets_down, down)
@@ -280,8 +281,8 @@ def one_sided(values: Field, grid: Grid, axis: int, link: Links | None = None) -
 def _neighbours(values: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
     """The values one step up and one step down along an axis.
 
-    XLA fuses a concatenation into the loop over the nodes, except one along the last axis. There two slices of a
-    longer array are fused: one array is filled in place of two. In many dimensions, where memory rules, none is.
+    XLA fuses a concatenation into the loop over the nodes, except along the last axis. There two slices of a longer
+    array are fused, so one array is stored instead of two. In many dimensions, where memory is scarce, none is stored.
     """
     if axis < grid.ndim - 1 or grid.ndim > LONGER:
         return continued(values, grid, unit(grid, axis, 1)), continued(values, grid, unit(grid, axis, -1))
@@ -293,51 +294,51 @@ def _neighbours(values: Field, grid: Grid, axis: int) -> tuple[Field, Field]:
 def limited(
     up: Field, down: Field, grid: Grid, axis: int, link: Links, noisy: Mapping[int, Array] | None = None
 ) -> tuple[Field, Field]:
-    """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across a wall as they are.
+    """Second-order one-sided slopes from the differences D⁺, D⁻ along one axis; zero across a wall.
 
-    Next to an edge, and to the boundary of a target, the second difference is continued as a constant; at a wall on
-    which noise reflects, where ``noisy`` says so, it is that of the mirror image (see ``noisy_walls``).
+    Next to an edge, and to the boundary of a target, the second difference is extrapolated as a constant. At a wall on
+    which noise reflects, according to ``noisy``, the mirror image gives it (see ``noisy_walls``).
     """
-    bend = 2 * (up - down) / (link.up + link.down)  # V'' on two gaps of any length
+    bend = 2 * (up - down) / (link.up + link.down)  # V'' from two gaps of any lengths
     for step in (1, -1):
-        if sloped(grid, axis, step) is not None:  # the mirror image with the prescribed slope has the bend of V
+        if sloped(grid, axis, step) is not None:  # already the bend of the mirror image
             continue
-        # D⁺ or D⁻ is missing on an edge, and with it the bend: that of the node before is taken
+        # on an edge D⁺ or D⁻ is missing, so the second difference of the node before is used
         ended = neighbour(bend, grid, unit(grid, axis, -step))
         if noisy and step in noisy:
             ended = jnp.where(noisy[step], 2 * bend, ended)
         bend = jnp.where(on_edge(grid, axis, step), ended, bend)
     above, below = (neighbour(bend, grid, unit(grid, axis, step)) for step in (1, -1))
-    # nodes inside a target hold no smooth continuation of V: the bend of this side is taken for both
+    # inside a target V has no smooth continuation, so the second difference of this side is used for both
     if link.meets_up is not None:
         above = jnp.where(link.meets_up[0], bend, above)
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
-    # V(x ± h) = V ± h V' + h²/2 V'': half a gap times the bend is the leading error of a one-sided difference
+    # V(x ± h) = V ± h V' + h²/2 V'': half a gap times V'' is the leading error of a one-sided difference
     up, down = up - link.up / 2 * van_albada(bend, above), down + link.down / 2 * van_albada(bend, below)
     return stopped(up, down, grid, axis)
 
 
 def van_albada(a: Field, b: Field) -> Field:
-    """The mean a b (a + b)/(a² + b²) of two bends, zero where their signs differ: G. D. van Albada's limiter."""
+    """The mean a b (a + b)/(a² + b²) of two second differences, zero if their signs differ (G. D. van Albada)."""
     agree = a * b > 0
-    # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back
+    # the inner where keeps 0/0 out of the branch not taken, whose NaN would enter the derivative
     return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
 
 
 def numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:
-    """The number in C order of the node x + offset for every node x, shape (*grid), round all axes; host level."""
+    """The flat index of the node x + offset for every node x, shape (*grid), wrapped on all axes; host level."""
     number = np.arange(grid.size).reshape(grid.shape)
-    # round axes that are not periodic as well: whoever asks has zero entries there
+    # also wraps axes that are not periodic, because callers have zero entries there
     return np.roll(number, [-step for step in offset], axis=range(grid.ndim))
 
 
 def sparse(
     offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid
 ) -> "csr_array":
-    """The matrix with ``diagonal`` and, for every offset o, entry values_o(x) in row x and column x + o.
+    """The matrix with ``diagonal`` and, for every offset o, the entry values_o(x) in row x and column x + o.
 
-    Host level. Nodes are numbered in C order. Entries whose column lies outside the box must be zero.
+    Host level. Nodes are indexed in C order. Entries whose column is outside the box must be zero.
 
     Returns:
       A SciPy CSR array of shape (nodes, nodes) without explicit zeros off the diagonal.
@@ -352,5 +353,5 @@ def sparse(
         columns.append(numbers(grid, offset).ravel()[nonzero])
         entries.append(np.asarray(value, np.float64).ravel()[nonzero])
     index = (np.concatenate(rows), np.concatenate(columns))
-    # entries at one place add up, as of two jumps over the seam of an axis with two nodes
+    # coinciding entries add up, as for two jumps over the seam of an axis with two nodes
     return coo_array((np.concatenate(entries), index), shape=(grid.size, grid.size)).tocsr()

@@ -1,7 +1,7 @@
-"""Steps, pure and jittable: from a value to a better one, and what bounds its error.
+"""Pure, jittable iteration steps, and bounds on their errors.
 
-Read ``bellman`` for one step and its linear equation, ``evaluation`` with ``gauss_seidel`` for how that is solved,
-``methods`` for what there is to choose, ``fixed_point`` for value and policy iteration (``arc_iteration``: on arcs of
-many cells), ``certificates`` for bounds, ``time_methods`` and ``time_stepping`` for steps in time, and ``adjoint`` for
-derivatives of a fixed point.
+Read ``bellman`` for one step and its linear equation, ``evaluation`` and ``gauss_seidel`` for the solution of that
+equation, ``methods`` for the available methods, ``fixed_point`` for value and policy iteration (``arc_iteration`` for
+arcs of many cells), ``certificates`` for bounds, ``time_methods`` and ``time_stepping`` for steps in time, and
+``adjoint`` for derivatives of a fixed point.
 """

@@ -1,18 +1,19 @@
 """The derivative of a solution with respect to the numbers in the problem and in the grid.
 
-The value V of a converged solve satisfies Φ(V, θ) = 0, node by node the active one of (H(u, d) − β V)/(Q + β),
-ψ − V, g − V and given − V. With W the weights of the optimal policy ∂Φ/∂V = −(I − W), so that
+The value V of a converged solve satisfies Φ(V, θ) = 0. At each node Φ is the active one of (H(u, d) − β V)/(Q + β),
+ψ − V, g − V and prescribed value − V. With W the weights of the optimal policy ∂Φ/∂V = −(I − W), so
 
     dV = (I − W)⁻¹ ∂Φ/∂θ dθ.
 
-∂Φ/∂θ is taken through the formulas that give the optimal action: where that is stationary they contribute nothing,
-and where it sits at a bound or at a kink of the upwinding, both of which may move with θ, they do. Forward mode
-takes one linear solve and reverse mode one transposed solve, whatever the number of steps that led to V. A linear solve
-that does not come to its end makes the derivative NaN; the value stays as it is. The policy moves with V and θ as the
-optimum of the Hamiltonian does, see ``sensitivity``.
+∂Φ/∂θ is taken through the formulas for the optimal action. These contribute nothing where the action is stationary, but
+they do where it is at a bound or at a kink of the upwinding, since both may move with θ. Forward mode takes one linear
+solve and reverse mode one transposed solve, independently of the number of steps that led to V. A linear solve that
+does not converge makes the derivative NaN; the value is unchanged. The policy is differentiated as the optimum of the
+Hamiltonian in V and θ, see ``sensitivity``.
 
-With slopes of high order Φ is not linear in V, and its derivative is no chain's: it is taken of the limited slopes as
-they stand, at frozen actions, and a Krylov method, preconditioned by sweeps with I − W, solves with it.
+With high-order slopes Φ is not linear in V, and its derivative is not the matrix of a chain. The limited slopes are
+then differentiated at fixed actions, and a Krylov method, preconditioned by sweeps with I − W, solves the linear
+system.
 """
 
 import functools
@@ -35,21 +36,21 @@ from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Field, Number, Scalar
 
-Map: TypeAlias = Callable[[Field], Field]  # of node values
-LinearSolve: TypeAlias = Callable[[Map, Field], Field]  # of a matrix-free product and the right-hand side
+Map: TypeAlias = Callable[[Field], Field]  # maps node values to node values
+LinearSolve: TypeAlias = Callable[[Map, Field], Field]  # from a matrix-free product and the right-hand side
 Actions: TypeAlias = tuple[Action, Action]  # of the control and of the disturbance
-Refinement: TypeAlias = tuple[Field, Field, Scalar, Scalar]  # δ, its residual, the size of the last one, steps
+Refinement: TypeAlias = tuple[Field, Field, Scalar, Scalar]  # δ, residual, previous size, steps
 
-STEPS = 200  # refinements of the linear solve in each of its two stages, at most
-SLOW = 0.5  # a refinement that leaves more than this share of the residual hands over to Krylov's
-GOAL = 1e3  # of the rounding unit of the right-hand side
-ROUNDING = 64  # of the rounding unit of the solution: below that no residual can be brought
-FRACTION = 1e-3  # of the residual, to which one run of the Krylov method goes that solves with slopes of high order
-KRYLOV = 200  # its steps, at most
+STEPS = 200  # largest number of refinements of the linear solve in each of its two stages
+SLOW = 0.5  # if a refinement leaves more than this fraction of the residual, Krylov takes over
+GOAL = 1e3  # in units of the rounding error of the right-hand side
+ROUNDING = 64  # in units of the rounding error of the solution, below which no residual can fall
+FRACTION = 1e-3  # fraction of the residual to which one run of the Krylov method for high-order slopes reduces it
+KRYLOV = 200  # largest number of steps of that run
 
 
 class Answer(Protocol):
-    """A value and its policy, found without derivatives."""
+    """A value and its policy, computed without derivatives."""
 
     @property
     def value(self) -> Field:
@@ -62,13 +63,13 @@ class Answer(Protocol):
 
 @pytree_dataclass()
 class FixedPoint:
-    """The equation Φ(V, θ) = 0 at the nodes, with all numbers θ in it.
+    """The equation Φ(V, θ) = 0 at the nodes, as a pytree with all numbers θ.
 
     Args:
       on: the problem on its grid.
       obstacles: fixed nodes and constraints.
-      lost: the nodes to which no action may lead, bool (*grid), or None.
-      arriving: what comes to the running cost, as V/Δt in an implicit step; cost per unit time.
+      lost: the unreachable nodes, to which no action may lead, bool (*grid), or None.
+      arriving: an addition to the running cost, such as V/Δt in an implicit step; cost per unit time.
     """
 
     on: Discretisation
@@ -77,11 +78,12 @@ class FixedPoint:
     arriving: Number | Field = 0.0
 
     def residual(self, value: Field, actions: Actions, bound: jax.Array) -> Field:
-        """Φ at a value on frozen branches; ``bound`` says at which nodes a constraint may be the active one."""
+        """Φ at a value with fixed branches; ``bound`` marks the nodes at which a constraint may be active."""
         on, obstacles = self.on, self.obstacles
         rate = discrete.around(on, value, self.lost).at(*actions) + self.arriving - on.problem.discount * value
         outflow = jax.lax.stop_gradient(jump_rates(on, *actions).total() + on.problem.discount)
-        # divided as the equation is, so that ∂Φ/∂V = −(I − W); a derivative of the divisor would be multiplied by r = 0
+        # divided like the equation, so that ∂Φ/∂V = −(I − W); the derivative of the divisor would be multiplied by r =
+        # 0
         phi = jnp.where(obstacles.fixed, 0, rate) / jnp.where(outflow > 0, outflow, 1)
         for constraint in (obstacles.upper, obstacles.lower):
             if constraint is not None:
@@ -93,7 +95,7 @@ def attach(task: Task, answer: Answer) -> Field:
     """The value of ``answer``, unchanged, as a differentiable function of the problem and of the grid in ``task``.
 
     Args:
-      task: the task as the user gave it, with its tracers.
+      task: the task as the user posed it, with its tracers.
       answer: the solution of the same task.
     """
     question = FixedPoint(task.on, task.obstacles, task.lost)
@@ -105,14 +107,14 @@ def attach_step(
     on: Discretisation, obstacles: Obstacles, arriving: Field, found: tuple[Field, Greedy, PolicyEquation],
     evaluation: Evaluation,
 ) -> Field:  # fmt: skip
-    """The value after an implicit step, unchanged, as a differentiable function of the question that it answers.
+    """The value after an implicit step, unchanged, as a differentiable function of the step's equation.
 
     Args:
       on: the problem with the discount of the step, with its tracers.
       obstacles: fixed nodes and constraints at the end of the step.
-      arriving: the value before the step over its length, cost per unit time.
-      found: the value after it, its policy and the linear equation of that, without derivatives.
-      evaluation: how a policy is evaluated.
+      arriving: the value before the step divided by its length, cost per unit time.
+      found: the value after the step, its policy and the policy's linear equation, without derivatives.
+      evaluation: the method of policy evaluation.
     """
     value, policy, equation = found
     return _solution(value, FixedPoint(on, obstacles, None, arriving), policy, equation, evaluation)
@@ -122,21 +124,21 @@ def attach_step(
 def _solution(
     value: Field, question: FixedPoint, policy: Greedy, equation: PolicyEquation, evaluation: Evaluation
 ) -> Field:
-    """``value``, with the derivative of the solution of ``question``; formed only where it is asked for."""
+    """``value``, with the derivative of the solution of ``question``; computed on demand."""
     return value
 
 
 @_solution.defjvp
 @own_settings()
 def _solution_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
-    """The value, and its tangent by one linear solve; transposed, by one transposed solve."""
+    """The value, and its tangent by one linear solve; transposition gives one transposed solve."""
     value, question, policy, equation, evaluation = primals
     actions, grid = (list(policy.controls), list(policy.disturbances)), question.on.grid
     equation = _tied_to_constraints(equation, question.obstacles, value)
-    bound = equation.weights.total() == 0  # rows of the constraints hold no weights
+    bound = equation.weights.total() == 0  # rows of active constraints have no weights
 
     def residual(question: FixedPoint) -> Field:
-        moved = sensitivity.actions(question.on, value, question.lost, *actions)  # as at an end or at a kink that moves
+        moved = sensitivity.actions(question.on, value, question.lost, *actions)  # follows ends and kinks that move
         return question.residual(value, moved, bound)
 
     operator: Map
@@ -147,17 +149,17 @@ def _solution_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
         slope = jax.linearize(lambda at: question.residual(at, actions, bound), value)[1]
         operator, solvers = lambda delta: -slope(delta), _high_order_solvers(equation, grid)
     right = jax.jvp(residual, (question,), (tangents[1],))[1]
-    # a product, whose transpose is NaN as well
+    # a product, so that its transpose is NaN too
     right = right * jnp.where(jnp.any(_rests_unheld(question, actions, value)), jnp.nan, 1).astype(right.dtype)
-    # the value, the policy and the operator are constants here, whose own derivatives a second one would need
+    # value, policy and operator are constants here; a second derivative would require theirs
     right = right + once(question, "a solve").astype(right.dtype)
     return value, jax.lax.custom_linear_solve(operator, right, *solvers)
 
 
 def _rests_unheld(question: FixedPoint, actions: Actions, value: Field) -> jax.Array:
-    """The nodes at which the policy rests at no discount, although their value is not given: it has no derivative.
+    """The free nodes at which the policy rests without discount, so that the value has no derivative.
 
-    Leaving is worth as much there, and which of the two the search found first is chance.
+    Leaving is equally good there, and the search may find either action first.
     """
     on, obstacles = jax.lax.stop_gradient((question.on, question.obstacles))
     rests = (jump_rates(on, *actions).total() + on.problem.discount <= 0) & ~obstacles.fixed
@@ -171,9 +173,9 @@ def attach_policy(task: Task, policy: Greedy, value: Field) -> Greedy:
     """The policy, its numbers unchanged, as a differentiable function of ``value`` and of ``task``.
 
     Args:
-      task: the task as the user gave it, with its tracers.
-      policy: that of the solution of the same task.
-      value: its value with derivatives, of ``attach``.
+      task: the task as the user posed it, with its tracers.
+      policy: the policy of the solution of the same task.
+      value: the value with derivatives, from ``attach``.
     """
     frozen, policy = jax.lax.stop_gradient((task, policy))
     return _moving(policy, task.on, value, frozen)
@@ -181,7 +183,7 @@ def attach_policy(task: Task, policy: Greedy, value: Field) -> Greedy:
 
 @jax.custom_jvp
 def _moving(policy: Greedy, on: Discretisation, value: Field, task: Task) -> Greedy:
-    """``policy``, with the derivative of the optimum of the Hamiltonian; formed only where it is asked for."""
+    """``policy``, with the derivative of the optimum of the Hamiltonian; computed on demand."""
     return policy
 
 
@@ -206,13 +208,13 @@ def _moving_tangent(primals: Any, tangents: Any) -> tuple[Greedy, Greedy]:
 
 
 def _chain_product(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
-    """(I − W) δ, with W the weights of an equation."""
+    """(I − W) δ, with the weights W of an equation."""
     return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
 
 def _chain_solvers(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> tuple[LinearSolve, LinearSolve]:
-    """The solves of I − W and of its transpose."""
-    if grid.sides("open"):  # the transposed row of a parabola belongs to no chain: both matrices are factored
+    """The solvers for I − W and for its transpose."""
+    if grid.sides("open"):  # the transposed row of a parabola does not belong to a chain, so both matrices are factored
         forward, backward = (_exact(equation, grid, transposed) for transposed in (False, True))
         return lambda _, right: forward(right), lambda _, right: backward(right)
 
@@ -223,23 +225,24 @@ def _chain_solvers(evaluation: Evaluation, equation: PolicyEquation, grid: Grid)
 
 
 def _exact(equation: PolicyEquation, grid: Grid, transposed: bool) -> Map:
-    """The solve of I − W, or of its transpose, by factorisation."""
+    """The solver for I − W, or for its transpose, by factorisation."""
     return lambda right: direct(PolicyEquation(right, equation.weights), grid, transposed=transposed)
 
 
 def _high_order_solvers(equation: PolicyEquation, grid: Grid) -> tuple[LinearSolve, LinearSolve]:
-    """The solves of −∂Φ/∂V and of its transpose for slopes of high order, preconditioned by the matrix of the chain."""
+    """The solvers for −∂Φ/∂V and its transpose with high-order slopes, preconditioned by the matrix of the chain."""
 
     def sweeps(weights: Rates) -> Map:
         return lambda left: relaxed(PolicyEquation(left, weights), grid, 1)
 
     def solver(precondition: Map) -> LinearSolve:
         def correct(matvec: Map, left: Field) -> Field:
-            # by GMRES with 20 vectors it took 2.4 times as long on 100 x 101 nodes of a pendulum, and to compile 2
+            # GMRES with 20 vectors took 2.4 times as long on 100 x 101 nodes of a pendulum, and twice as long to
+            # compile
             delta, _ = jax.scipy.sparse.linalg.bicgstab(
                 matvec, left, jnp.zeros_like(left), tol=FRACTION, maxiter=KRYLOV, M=precondition
             )
-            # it may break down: then a sweep, which always makes sense
+            # if it breaks down, use a sweep, which is always safe
             gains = jnp.max(jnp.abs(left - matvec(delta))) <= jnp.max(jnp.abs(left))
             return jax.lax.cond(gains, lambda: delta, lambda: precondition(left))
 
@@ -255,52 +258,52 @@ def _high_order_solvers(equation: PolicyEquation, grid: Grid) -> tuple[LinearSol
 
 
 def _tied_to_constraints(equation: PolicyEquation, obstacles: Obstacles, value: Field) -> PolicyEquation:
-    """The linear equation of a policy, in which every node whose value is a constraint's belongs to that.
+    """The linear equation of a policy, with every node whose value equals a constraint assigned to that constraint.
 
-    Where going on is worth as much both branches hold. On a plateau without discount only this one has a derivative:
-    a policy may go round on it for ever.
+    Where continuing is equally good both branches hold. On a plateau without discount only the constraint has a
+    derivative, since a policy may cycle there indefinitely.
     """
     free = jnp.ones(value.shape, bool)
     for constraint in (obstacles.upper, obstacles.lower):
         if constraint is not None:
             free &= ~_is_constraint(value, constraint)
-    # a row without weights reads δ = s, the derivative of the constraint itself
+    # a row without weights reads δ = s, the derivative of the constraint
     return PolicyEquation(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
 
 
 def _is_constraint(value: Field, constraint: Field) -> jax.Array:
-    """The nodes where a value was taken from the constraint, which rounds otherwise whenever it is evaluated anew."""
-    # by the size of both, so that ψ = 0 is met exactly and nothing has a unit
+    """The nodes where the value equals the constraint, up to rounding in a repeated evaluation of it."""
+    # relative to both sizes, so that ψ = 0 must match exactly and units do not matter
     size = jnp.abs(value) + jnp.abs(constraint)
     return jax.lax.stop_gradient(jnp.abs(value - constraint) <= 64 * jnp.finfo(value.dtype).eps * size)
 
 
 def refined(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:
-    """δ by iterative refinement, to a small multiple of rounding; NaN where that is not reached.
+    """δ by iterative refinement, to a small multiple of rounding; NaN if it does not get there.
 
-    Sweeps hardly gain where little is discounted and the drift goes round in circles: there Krylov takes over.
+    Sweeps converge slowly if the discount is small and the drift rotates; then Krylov takes over.
     """
 
     def by(method: Evaluation) -> Map:
         return lambda left: evaluate(method, PolicyEquation(left, equation.weights), grid)
 
-    # to the end, however slowly, with the last of them: nothing follows it
+    # the last stage runs to the end, however slowly
     stages = [(by(evaluation), SLOW), (by(Krylov()), jnp.inf)] if evaluation.rough else [(by(evaluation), jnp.inf)]
     return solve_in_stages(equation.source, functools.partial(left_over, equation, grid), stages)
 
 
 def solve_in_stages(right: Field, left_over: Map, stages: Sequence[tuple[Map, Number]]) -> Field:
-    """The solution of a linear system by corrections of what is left, one kind after the other; NaN if not reached.
+    """Solve a linear system by corrections of the residual, in stages; NaN if the goal is not reached.
 
     Args:
-      right: the right-hand side, which sets the size of rounding.
-      left_over: from δ to the residual that it leaves.
-      stages: a correction from a residual, and the share of it that may be left before the next kind takes over.
+      right: the right-hand side, which sets the scale of rounding.
+      left_over: maps δ to its residual.
+      stages: pairs of a correction from a residual, and the fraction of the residual above which the next stage starts.
     """
     eps, size = jnp.finfo(right.dtype).eps, jnp.max(jnp.abs(right))
 
     def goal(delta: Field) -> Scalar:
-        # a residual is a difference of numbers of the size of δ, which may be far larger than the right-hand side
+        # the residual is a difference of numbers of the size of δ, which may be far larger than the right-hand side
         return eps * (GOAL * size + ROUNDING * jnp.max(jnp.abs(delta)))
 
     def stage(correct: Map, delta: Field, slow: Number) -> Field:
@@ -313,7 +316,7 @@ def solve_in_stages(right: Field, left_over: Map, stages: Sequence[tuple[Map, Nu
         def unfinished(carry: Refinement) -> jax.Array:
             delta, left, before, count = carry
             size = jnp.max(jnp.abs(left))
-            # a NaN is no size > …: it ends the loop, and is a NaN below
+            # comparisons with NaN are false, so NaN ends the loop and the result is NaN
             return (size > goal(delta)) & (count < STEPS) & ~(size > slow * before)
 
         before, none = jnp.full((), jnp.inf, delta.dtype), jnp.zeros((), jnp.int32)

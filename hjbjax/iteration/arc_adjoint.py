@@ -1,12 +1,12 @@
 """The derivative of a solution on arcs with respect to the numbers in the problem and in the grid.
 
-The value V of a converged solve satisfies, at every node that is not held,
+The value V of a converged solve satisfies, at every free node,
 
     Φ(V, θ) = pay(θ) + keep(θ) I[V](y(θ)) − V = 0
 
-for the best arc of the node, whose action and length stay as they are. With W the weights of that arc
-∂Φ/∂V = −(I − W), so that dV = (I − W)⁻¹ ∂Φ/∂θ dθ: one linear solve in forward mode and one transposed solve in reverse
-mode. All arcs that are best arrive, so the solve may follow them again and again.
+for the best arc of the node, with fixed action and length. Let W be the weights of that arc. Then ∂Φ/∂V = −(I − W), so
+dV = (I − W)⁻¹ ∂Φ/∂θ dθ: one linear solve in forward mode and one transposed solve in reverse mode. Sequences of best
+arcs always reach the target, so the solve can follow them repeatedly.
 """
 
 import functools
@@ -26,19 +26,19 @@ from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import AtNodes, Field, Mask, Scalar
 
-FOLLOWED = 32  # arcs in a row between two evaluations of the residual
+FOLLOWED = 32  # arcs followed between two evaluations of the residual
 
 
 @pytree_dataclass(static=("legs",))
 class ArcEquation:
-    """The equation of the best arcs, with all numbers θ in it.
+    """The equation of the best arcs, as a pytree with all numbers θ.
 
     Args:
       on: the problem on its grid.
-      actions: those of the plan, (A, m).
+      actions: the actions of the plan, (A, m).
       legs: the lengths of its arcs, R integers.
       number: the best arc of every node, integers (*grid).
-      fixed: bool (*grid), the nodes whose value is prescribed, unreachable ones among them.
+      fixed: bool (*grid), the nodes with prescribed values, including unreachable nodes.
       counted: bool (*grid), the nodes with a finite value.
     """
 
@@ -69,7 +69,7 @@ def attach(value: Field, equation: ArcEquation) -> Field:
 @attach.defjvp
 @own_settings()
 def _attach_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
-    """The value, and its tangent by one linear solve; transposed, by one transposed solve."""
+    """The value, and its tangent by one linear solve; transposition gives one transposed solve."""
     value, equation = primals
     grid, best = equation.on.grid, jax.lax.stop_gradient(equation.best())
 
@@ -82,13 +82,13 @@ def _attach_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
         return delta - weighted(delta)
 
     right = jax.jvp(lambda question: question.residual(value), (equation,), (tangents[1],))[1]
-    # the value and the operator are constants here, whose own derivatives a second one would need
+    # value and operator are constants here; a second derivative would require theirs
     right = right + once(equation, "a solve").astype(right.dtype)
     return value, jax.lax.custom_linear_solve(operator, right, _solve, _solve)
 
 
 def _solve(matvec: Map, right: Field) -> Field:
-    """δ with (I − W) δ = right, or with the transposed matrix."""
+    """Solve (I − W) δ = right, or the transposed system."""
 
     def follow(left: Field) -> Field:
         def once_more(_: Scalar, delta: Field) -> Field:
@@ -100,5 +100,5 @@ def _solve(matvec: Map, right: Field) -> Field:
 
 
 def _left_over(matvec: Map, right: Field, delta: Field) -> Field:
-    """What δ leaves of the right-hand side."""
+    """The residual of δ."""
     return right - matvec(delta)

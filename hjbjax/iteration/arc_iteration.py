@@ -1,16 +1,16 @@
-"""Value and policy iteration on arcs: V ← min(ψ, min over arcs of Q), and relaxations of the arcs that are best.
+"""Value and policy iteration on arcs: V ← min(ψ, min over arcs of Q), and relaxations along the best arcs.
 
-With Q = pay + keep · I[V] of every arc (see ``arcs``), r = min Q − V is the residual, in cost units, κ = ``keep`` and
+For every arc Q = pay + keep · I[V] (see ``arcs``). With the residual r = min Q − V in cost units, and κ = ``keep``,
 
     residual = min(r, ψ − V);    V − max (V − Q)⁺/(1 − κ) ≤ V_h ≤ V + max r/(1 − κ),
 
-on the left over all arcs of all nodes, on the right of the best arc where r > 0: V + ε is a supersolution if one arc of
-every node has Q + κ ε ≤ V + ε, and V − ε a subsolution if all arcs have Q − κ ε ≥ V − ε. Without a discount, with the
-running cost c > 0 of an arc in place of 1 − κ, likewise V/(1 + η) ≤ V_h ≤ V/(1 − ρ), as in ``certificates``.
+where the lower bound uses all arcs of all nodes, and the upper bound the best arc where r > 0: V + ε is a supersolution
+if one arc of every node has Q + κ ε ≤ V + ε, and V − ε a subsolution if all arcs have Q − κ ε ≥ V − ε. Without a
+discount the running cost c > 0 of an arc replaces 1 − κ in V/(1 + η) ≤ V_h ≤ V/(1 − ρ), as in ``certificates``.
 
-A step follows each node's best arc again and again, and then looks at all arcs: modified policy iteration. Value
-iteration follows it once. Since an arc leads several cells on, V is told from the target to the ends of the box in as
-many relaxations as arcs follow one another.
+A step follows each node's best arc several times and then evaluates all arcs, which is modified policy iteration. Value
+iteration follows it once. Because an arc crosses several cells, information travels from the target to the ends of the
+box in one relaxation per arc of the path.
 """
 
 import dataclasses
@@ -38,13 +38,13 @@ class ArcTask:
     """The constants of a solve on arcs.
 
     Args:
-      grid: the nodes.
-      arcs: all that are tried.
+      grid: the grid.
+      arcs: all arcs to try.
       obstacles: fixed nodes and the stopping cost.
-      counted: bool (*grid), the nodes with a finite value; from them no arc leads to others.
-      tol: certified error to reach, cost units.
+      counted: bool (*grid), the nodes with a finite value; no arc leads from them to other nodes.
+      tol: the certified error to reach, cost units.
       certificate: additive or multiplicative.
-      relaxations: how often the best arcs are followed between two looks at all of them.
+      relaxations: number of times the best arcs are followed between two evaluations of all arcs.
     """
 
     grid: Grid
@@ -56,26 +56,26 @@ class ArcTask:
     relaxations: int
 
     def impose(self, value: Field) -> Field:
-        """``value`` with the constraints put in, and zero where it does not count."""
+        """``value`` with the constraints imposed, and zero at nodes that do not count."""
         return jnp.where(self.counted, self.obstacles.impose(value), 0)
 
 
 @pytree_dataclass()
 class ArcState:
-    """State of a solve on arcs: a value, its best arcs, its certificate, and the loop's book-keeping."""
+    """State of a solve on arcs: a value, its best arcs, its certificate, and the bookkeeping of the loop."""
 
     value: Field
-    number: AtNodes  # of the best arc from every node
+    number: AtNodes  # the number of the best arc from every node
     bound: ErrorBound
     step: Scalar
     best: jax.Array  # the least error and the least residual so far, (2,)
     since_best: Scalar
     code: Scalar
-    history: jax.Array  # residuals of this chunk, (HISTORY,), −1 where there was no step
+    history: jax.Array  # residuals of this chunk, (HISTORY,), −1 for unused entries
 
 
 class Look(NamedTuple):
-    """All arcs at one value: the least Q, its number, and how far Q lies under V next to what the arc costs."""
+    """An evaluation of all arcs: the least Q, its number, and the excess of V over Q relative to the arc's cost."""
 
     worth: Field
     number: AtNodes
@@ -83,7 +83,7 @@ class Look(NamedTuple):
 
 
 def begin(task: ArcTask, guess: Nodes) -> ArcState:
-    """The state before the first look at a guess, which is step −1 of ``run``; NumPy, so that nothing is compiled."""
+    """The state before the evaluation of a guess, which is step −1 of ``run``; NumPy, so that nothing is compiled."""
     dtype, infinite = guess.dtype, np.asarray(np.inf, guess.dtype)
     numbers: Any = (-infinite, infinite, np.zeros((), dtype), infinite, infinite)
     number: Any = np.zeros(task.grid.shape, np.int32)
@@ -95,11 +95,12 @@ def begin(task: ArcTask, guess: Nodes) -> ArcState:
 
 
 def start(task: ArcTask) -> Field:
-    """A value from above, from which relaxations descend, with the constraints put in.
+    """A value above the solution, from which relaxations descend, with the constraints imposed.
 
-    From below every node would first take the shortest arc, which pays least at once, and V climb by a cell a
-    relaxation. Under a discount there is a constant V with min Q ≤ V: the largest over the nodes of min pay/(1 − keep).
-    Without one, and so without such a constant, as many arcs as the axes have nodes, each at the dearest node.
+    From below, every node would first take the shortest arc, which pays least, and V would rise by one cell per
+    relaxation. With a discount the start is a constant V with min Q ≤ V: the largest over the nodes of min pay/(1 −
+    keep). Without a discount there is no such constant; the start is the cost of one arc at the most
+    expensive node, times the sum of the nodes over the axes.
     """
     arcs, free = task.arcs, task.counted & ~task.obstacles.fixed
     least = jnp.full(task.grid.shape, jnp.inf, arcs.pay.dtype)
@@ -113,12 +114,12 @@ def start(task: ArcTask) -> Field:
     if arcs.running is not None:
         ends = jnp.max(jnp.where(jnp.isfinite(arcs.pay), arcs.pay, -jnp.inf))
         dearest = sum(task.grid.shape) * dearest + jnp.maximum(ends, 0)
-    value = jnp.where(jnp.isfinite(dearest), dearest, 0)  # where all is given there is nothing to start from
+    value = jnp.where(jnp.isfinite(dearest), dearest, 0)  # if all nodes are fixed there is nothing to start from
     return task.impose(jnp.full(task.grid.shape, value))
 
 
 def run(task: ArcTask, state: ArcState, until: Number) -> ArcState:
-    """Steps until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
+    """Step until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
     start = state.step
 
     def goes_on(at: ArcState) -> jax.Array:
@@ -128,7 +129,7 @@ def run(task: ArcTask, state: ArcState, until: Number) -> ArcState:
 
 
 def look(task: ArcTask, value: Field) -> Look:
-    """The best arc from every node; the first of equals."""
+    """The best arc from every node; the first one on ties."""
     wide, shape = widened(value, task.grid), task.grid.shape
 
     def also(k: Scalar, best: Look) -> Look:
@@ -143,19 +144,19 @@ def look(task: ArcTask, value: Field) -> Look:
 
 
 def _unit(arcs: Arcs) -> jax.Array:
-    """What r is divided by in the certificate: 1 − e^{−βτ}, or without a discount the running cost of an arc.
+    """The divisor of r in the certificate: 1 − e^{−βτ}, or without a discount the running cost of an arc.
 
-    Of an arc that ends on the target all of Q is paid, with the exit cost, if that is not negative: next to a target
-    the running cost alone may be as small as the rounding of V.
+    For an arc that ends on the target it is Q, including the exit cost unless this is negative, because next to a
+    target the running cost may be as small as the rounding error of V.
     """
     if arcs.running is None:
         return 1 - arcs.keep
-    ends = (arcs.keep == 0) & jnp.isfinite(arcs.pay)  # infinite: an arc that leads to a lost node
+    ends = (arcs.keep == 0) & jnp.isfinite(arcs.pay)  # infinite for an arc to an unreachable node
     return jnp.where(ends, jnp.maximum(arcs.running, arcs.pay), arcs.running)
 
 
 def _advance(task: ArcTask, state: ArcState, start: Scalar) -> ArcState:
-    """One step: the best arcs relaxed, then a look at all of them; a step to numbers that are not finite is undone."""
+    """One step: relax along the best arcs, then evaluate all arcs; undo the step if its numbers are not finite."""
     value = _relaxed(task, state)
     found = look(task, value)
     bound = _bound(task, value, found)
@@ -165,7 +166,7 @@ def _advance(task: ArcTask, state: ArcState, start: Scalar) -> ArcState:
 
 
 def _relaxed(task: ArcTask, state: ArcState) -> Field:
-    """V with every node's best arc followed some times; of a guess, which was not looked at yet, V itself."""
+    """V after following every node's best arc several times; for a guess not yet evaluated, V itself."""
     arcs = task.arcs.chosen(state.number)
 
     def follow(_: Scalar, value: Field) -> Field:
@@ -180,7 +181,7 @@ def _bound(task: ArcTask, value: Field, found: Look) -> ErrorBound:
     obstacles, free = task.obstacles, task.counted & ~task.obstacles.fixed
     left = jnp.where(free, found.worth - value, 0)
     best = task.arcs.chosen(found.number)
-    # as the defect of a chain whose discount, or whose running cost, is one
+    # like the defect of a chain whose discount, or running cost, is one
     defect = jnp.where(left > 0, left / _unit(best), -found.decline)
     residual = left if obstacles.upper is None else jnp.where(free, jnp.minimum(left, obstacles.upper - value), 0)
     iterate = Iterate(
@@ -193,15 +194,15 @@ def _bound(task: ArcTask, value: Field, found: Look) -> ErrorBound:
     )
     if task.certificate is not Certificate.ADDITIVE:
         return bound
-    # that the best arcs all lead upwards says nothing of how far the others do
+    # the lower bound depends on all arcs, not only on the best ones, so it must not exceed V
     return dataclasses.replace(bound, below=jnp.minimum(bound.below, 0))
 
 
 def _judge(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar) -> Scalar:
-    """The status after a step; each line overrules those before it."""
+    """The status after a step; later lines override earlier ones."""
     size = jnp.max(jnp.where(task.counted, jnp.abs(value), 0))
     rounding = certificates.ROUNDING * jnp.finfo(value.dtype).eps * size
-    # a policy goes on by an arc a step, and a wave of better ones may cross the box four times
+    # a policy advances by one arc per step, and a wave of improvements may cross the box four times
     patience = jnp.where(bound.residual <= rounding, certificates.PATIENCE, 100 + 4 * sum(task.grid.shape))
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
     code = jnp.where(bound.error <= task.tol, Status.CONVERGED, code)
@@ -211,7 +212,7 @@ def _judge(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar) -> Sca
 def arriving(arcs: Arcs, grid: Grid, held: Mask, inside: AtNodes | None = None) -> AtNodes:
     """The nodes that some choice of arcs may bring to the target, without leaving ``inside``, bool (*grid).
 
-    Of the corners between which an arc ends one is nearer, and all are inside.
+    Such an arc ends in a cell whose corners are all inside, at least one of them nearer to the target.
     """
     zero = jnp.zeros(grid.shape, arcs.pay.dtype)
     outside = widened(zero if inside is None else zero + ~inside, grid)
@@ -227,15 +228,15 @@ def arriving(arcs: Arcs, grid: Grid, held: Mask, inside: AtNodes | None = None) 
 
         return jax.lax.fori_loop(0, arcs.count, also, near), near
 
-    # the second of the pair is the set before, empty at first: it grows until nothing is new
+    # iterate until the set stops growing; the second of the pair is the previous set, initially empty
     start = jnp.asarray(held), jnp.zeros(grid.shape, bool)
     return _until_still(grow, grow(start))
 
 
 def surely_arriving(arcs: Arcs, grid: Grid, held: Mask) -> AtNodes:
-    """The nodes from which some choice of arcs is sure to come to the target in the end, bool (*grid).
+    """The nodes from which some choice of arcs surely reaches the target, bool (*grid).
 
-    The largest set X from all of whose nodes one may arrive without leaving X.
+    This is the largest set X from whose nodes the target may be reached without leaving X.
     """
     everywhere = jnp.ones(grid.shape, bool)
 
@@ -246,12 +247,12 @@ def surely_arriving(arcs: Arcs, grid: Grid, held: Mask) -> AtNodes:
 
 
 def _until_still(step: Callable, pair: tuple[AtNodes, AtNodes]) -> AtNodes:
-    """The first of a pair of sets, the newer one and the one before it, once a step changes nothing more."""
+    """Iterate a pair of sets, the new one and the previous one, until nothing changes; return the new one."""
     return jax.lax.while_loop(lambda pair: jnp.any(pair[0] != pair[1]), step, pair)[0]
 
 
 def without(arcs: Arcs, grid: Grid, counted: Mask) -> Arcs:
-    """The arcs with those that lead to nodes that do not count made infinitely dear."""
+    """The arcs, with infinite cost for those that lead to nodes that do not count."""
     lost = widened(jnp.where(counted, 0.0, 1.0).astype(arcs.pay.dtype), grid)
 
     def each(one: Arcs) -> tuple[jax.Array, jax.Array]:

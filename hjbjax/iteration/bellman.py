@@ -1,13 +1,14 @@
-"""One step: the residual of the variational inequality, the greedy policy, and the linear equation it leaves.
+"""One step: the residual of the variational inequality, the greedy policy, and the policy's linear equation.
 
-At a node that is not held, with r = min_u max_d H(u, d) − β V in cost per unit time and s = r/(Q + β) its
-size in cost units (the Bellman operator of the chain is T V = V + s at the greedy action),
+At a free node let r = min_u max_d H(u, d) − β V, in cost per unit time, and s = r/(Q + β), its size in cost units. The
+Bellman operator of the chain is T V = V + s at the greedy action. Then
 
     residual = max(min(s, ψ − V), g − V),      V ← V + residual  is  V ← max(g, min(ψ, T V)).
 
-Nodes on the target, and rest points of an undiscounted problem, are held at given values. For one policy the
-equation is linear: δ = s + Σ_o w_o δ(x + o) with weights w_o = c_o/(Q + β), and s, w = ψ − V, 0 (or g − V, 0)
-where the constraint is the active branch. That correction is what every method solves, exactly or roughly.
+Nodes on the target, and rest points of an undiscounted problem, have fixed values. For one policy the equation is
+linear: δ = s + Σ_o w_o δ(x + o) with weights w_o = c_o/(Q + β). Where the constraint is the active branch, s = ψ − V
+  and
+w = 0 (or s = g − V). Every method solves this equation for the correction δ, exactly or approximately.
 """
 
 import dataclasses
@@ -25,20 +26,20 @@ from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 
-LEAK = 64  # units of eps of Q: a smaller rate towards a lost node is rounding
-ROUNDING = 8  # units of eps in (Q + β)|V|, below which one action is no better than another
+LEAK = 64  # units of eps of Q: a smaller rate towards an unreachable node is rounding
+ROUNDING = 8  # units of eps in (Q + β)|V|: a smaller gain of one action over another is rounding
 
 
 @pytree_dataclass()
 class Obstacles:
-    """Constraints on the value beside the equation itself, at every node.
+    """Constraints on the value in addition to the equation, at every node.
 
     Args:
-      fixed: bool (*grid), where the value is given.
-      fixed_value: the value there, (*grid) or a number.
+      fixed: bool (*grid), the nodes with prescribed values.
+      fixed_value: the prescribed values, (*grid) or a number.
       upper: ψ at the nodes, or None.
       lower: g at the nodes, or None.
-      ended: bool (*grid), the fixed nodes that are targets, where no action is taken any more.
+      ended: bool (*grid), the fixed nodes that are targets, where no further action is taken.
       least_exit: the least exit cost on boundaries between the nodes, a number; zero if none is negative.
     """
 
@@ -50,8 +51,8 @@ class Obstacles:
     least_exit: Number = 0.0
 
     def impose(self, value: Field) -> Field:
-        """``value`` with the given values put in and the constraints respected: max(g, min(ψ, V))."""
-        # ψ before g: where g > ψ the running maximum has the last word, as in the residual
+        """``value`` with fixed values inserted and constraints imposed: max(g, min(ψ, V))."""
+        # ψ before g: where g > ψ the running maximum takes precedence, as in the residual
         if self.upper is not None:
             value = jnp.minimum(value, self.upper)
         if self.lower is not None:
@@ -59,7 +60,7 @@ class Obstacles:
         return jnp.where(self.fixed, self.fixed_value, value)
 
     def clipped(self, step: Field, value: Field) -> Field:
-        """max(min(s, ψ − V), g − V) of a step s, and zero where V is given."""
+        """max(min(s, ψ − V), g − V) for a step s, and zero where V is fixed."""
         if self.upper is not None:
             step = jnp.minimum(step, self.upper - value)
         if self.lower is not None:
@@ -68,7 +69,7 @@ class Obstacles:
 
     def acting(self, value: Nodes) -> jax.Array:
         """The nodes at which actions matter, bool (*grid): not fixed, and no constraint is the active branch."""
-        acts = ~self.fixed  # where V = ψ one stops, and where V = g the maximum is here: no action matters
+        acts = ~self.fixed  # where V = ψ the run stops, and where V = g the maximum is attained, so no action matters
         if self.upper is not None:
             acts &= value < self.upper
         return acts if self.lower is None else acts & (value > self.lower)
@@ -76,7 +77,7 @@ class Obstacles:
 
 @pytree_dataclass()
 class Greedy:
-    """The greedy policy of a value function and the defect of the equation under it.
+    """The greedy policy of a value function and its defect in the equation.
 
     Args:
       defect: r = min max H − β V, (*grid), cost per unit time; zero where fixed.
@@ -93,7 +94,7 @@ class Greedy:
 class PolicyEquation:
     """The linear equation δ = source + Σ_o weights_o δ(x + o) for a correction δ of the value, in cost units.
 
-    ``fastest`` is the largest Q + β of its policy, per unit time, or the number that ``policy_equation`` was given.
+    ``fastest`` is the largest Q + β of its policy, per unit time, or the number passed to ``policy_equation``.
     """
 
     source: Field
@@ -102,14 +103,14 @@ class PolicyEquation:
 
 
 def obstacles(on: Discretisation) -> Obstacles:
-    """Target, stopping cost and running maximum at the nodes."""
+    """The target, stopping cost and running maximum at the nodes."""
     problem = on.problem
     exit_cost, stop, floor = (
         None if ingredient is None else on.at_nodes(ingredient)
         for ingredient in (problem.exit_cost, problem.stopping_cost, problem.running_max)
     )
     held = jnp.zeros(on.grid.shape, bool) if problem.target is None else cut_cells.level(on) <= 0
-    # off the target an exit cost says nothing, and may be no number
+    # outside the target the exit cost is irrelevant and may be NaN
     given = jnp.zeros((), on.dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
     for axis, step, end in on.grid.prescribed("dirichlet"):
         edge = jnp.asarray(stencil.on_edge(on.grid, axis, step))
@@ -127,19 +128,19 @@ def greedy(
     lost: jax.Array | None = None,
     first_order: jax.Array | None = None,
 ) -> Greedy:
-    """The optimal actions at ``value`` and the rate r that is left; an incumbent policy is among the candidates.
+    """The optimal actions at ``value`` and the defect r; an incumbent policy is among the candidates.
 
-    To the nodes that are ``lost``, bool (*grid), no drift leads that is only rounding; where ``first_order`` holds the
-    slopes are those of the chain.
+    Drift that is only rounding does not lead to ``lost`` nodes, bool (*grid). Where ``first_order`` is true
+    the slopes of the chain are used.
     """
     return _with_defect(on, value, held, *optimum.optimise(_around(on, value, incumbent, lost, first_order)))
 
 
 def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -> tuple[Field, Field]:
-    """The defect r = min max H − β V before any obstacle, and Q + β of the fastest action, for s = r/(Q + β).
+    """The defect r = min max H − β V before constraints, and Q + β of the fastest action, for s = r/(Q + β).
 
-    Actions are not kept. Without the ``outflow`` Q + β, (*grid), memory rules: rates are made where they are used, and
-    at best all of it is one pass over V.
+    Actions are not stored. Without the ``outflow`` Q + β, (*grid), memory is saved: rates are computed where they are
+    used, at best in a single pass over V.
     """
     hamiltonian = dataclasses.replace(discrete.around(on, value), bare=outflow is None)
     players, discount = players_of(on), on.problem.discount
@@ -149,19 +150,19 @@ def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -
     else:
         best, u, d = optimum.optimise(hamiltonian)
         outflow = jnp.maximum(outflow, jump_rates(on, u, d).total() + discount)  # a fast action between the samples
-    # it is divided by, also where nothing moves
+    # it is a divisor, also where nothing moves
     return best - discount * value, jnp.where(outflow > 0, outflow, 1)
 
 
 def improvement(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy, old: Greedy) -> Greedy:
     """The new policy where it is better by more than rounding or where nodes are ``fixed``, else the old one.
 
-    From a policy that ends, one improvement after the other then keeps it so: among actions that are worth the same
-    the first one found leads to where its value came from, and another one may go round. There is no disturbance.
+    Keeping the old action on ties keeps a proper policy proper: the first action found leads to the node from which the
+    value came, while an equally good one may lead into a cycle. There is no disturbance.
     """
     hamiltonian, u, discount = _around(on, value, None), list(old.controls), on.problem.discount
     rates = jump_rates(on, u, [])
-    # H − β V is a sum of c V(x + o) − c V(x): terms of the size of (Q + β)|V|, each rounded
+    # H − β V is a sum of c V(x + o) − c V(x): terms of size (Q + β)|V|, each rounded
     rounding = ROUNDING * jnp.finfo(on.dtype).eps * (rates.total() + discount) * jnp.abs(value)
     rate = hamiltonian.at(u, []) - discount * value
     stays = ~fixed & (rate <= new.defect + rounding)
@@ -178,12 +179,12 @@ def respond(
     lost: jax.Array | None = None,
     first_order: jax.Array | None = None,
 ) -> Greedy:
-    """The inner player's best answer to the outer player's current policy, in a game; masks as in ``greedy``."""
+    """The inner player's best response to the outer player's current policy, in a game; masks as in ``greedy``."""
     players = players_of(on)
-    # the current answer among the candidates: a sampled player then never answers worse than before
+    # the current response is among the candidates, so a sampled player never gets worse
     hamiltonian = _around(on, value, current, lost, first_order)
     u, d = list(current.controls), list(current.disturbances)
-    if on.problem.isaacs == "upper":  # min max: the control moves first, and the disturbance knows it
+    if on.problem.isaacs == "upper":  # min max: the control moves first, and the disturbance responds
         best, d = optimum.best_response(hamiltonian, players.disturbance, lambda d: (u, d))
     else:
         best, u = optimum.best_response(hamiltonian, players.control, lambda u: (u, d))
@@ -205,9 +206,9 @@ def _around(
 
 
 def _with_defect(on: Discretisation, value: Field, held: jax.Array, best: Field, u: Action, d: Action) -> Greedy:
-    """The policy u, d with its defect r = H − β V, zero where held; ``best`` is H."""
+    """The policy u, d with its defect r = H − β V, zero at fixed nodes; ``best`` is H."""
     rate = jnp.where(held, 0, best - on.problem.discount * value)
-    # an action that is one number for all nodes becomes an array: the carry of a loop has fixed shapes
+    # broadcast actions that are one number for all nodes: the carry of a loop has fixed shapes
     full = [tuple(jnp.broadcast_to(jnp.asarray(c, on.dtype), on.grid.shape) for c in action) for action in (u, d)]
     return Greedy(rate, *full)
 
@@ -215,17 +216,17 @@ def _with_defect(on: Discretisation, value: Field, held: jax.Array, best: Field,
 def policy_equation(
     on: Discretisation, value: Field, policy: Greedy, obstacles: Obstacles, *, fastest: Scalar | None = None
 ) -> PolicyEquation:
-    """The linear equation for δ under one policy; the active branch of the constraints is chosen node by node.
+    """The linear equation for δ under one policy; the active branch of the constraints is chosen at every node.
 
-    ``fastest``, where it is known of the same policy and time, spares a pass over the nodes. Zero spares it, too: then
-    every rate counts, however small it is beside the others.
+    ``fastest``, if known for the same policy and time, saves a pass over the nodes. Zero saves it too; then every rate
+    counts, however small.
     """
     u, d = list(policy.controls), list(policy.disturbances)
     rates = jump_rates(on, u, d)
     leaving = rates.total() + on.problem.discount
     fastest = on.grid.largest(leaving) if fastest is None else fastest
     moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
-    outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost piles up
+    outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost accumulates
     # s, then min(s, ψ − V), then max(·, g − V); a row whose branch is a constraint reads δ = source
     source, free = policy.defect / outflow, ~obstacles.fixed
     if obstacles.upper is not None:
@@ -237,7 +238,7 @@ def policy_equation(
     weights = rates.scaled(jnp.where(free, 1 / outflow, 0))
     if (
         on.scheme.subcell and on.problem.target is not None
-    ):  # what leads to a held node ends on the target's boundary, where nothing is to be corrected
+    ):  # links to fixed nodes end on the boundary of the target, where the correction is zero
         loose = ~obstacles.fixed
         jumps = zip(weights.offsets, weights.values, strict=True)
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
@@ -246,10 +247,11 @@ def policy_equation(
 
 
 def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:
-    """True if the policy leads from a node that counts to one that is ``lost``, by more than rounding."""
+    """True if the policy leads from a counted node to a ``lost`` one, by more than rounding."""
     grid, u, d = on.grid, list(policy.controls), list(policy.disturbances)
     rates, ends = jump_rates(on, u, d), list(zip(edges.beside(lost, grid), edges.slack(on), strict=True))
-    # each part of the drift by itself: of players upwinded apart one may lead where their sum does not
+    # each part of the drift separately: if players are upwinded separately, one may lead there although the sum does
+    # not
     leads = [
         functools.reduce(jnp.logical_or, (edges.leads(part[axis], *end) for part in on.drifts(u, d)))
         for axis, end in enumerate(ends)
@@ -257,10 +259,10 @@ def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) 
     leaking = jnp.zeros(grid.shape, on.dtype)
     for offset, c in zip(rates.offsets, rates.values, strict=True):
         leak = jnp.where(stencil.neighbour(~lost, grid, offset), 0, c)
-        if on.problem.noise is None:  # jumps go along one axis
+        if on.problem.noise is None:  # jumps along one axis
             axis = next(axis for axis, step in enumerate(offset) if step)
             leak = jnp.where(leads[axis], leak, 0)
-        leaking = leaking + leak  # rates per unit time, (*grid): several small leaks are one
-    # next to all rates of the node, since the drift is made of parts that cancel down to their rounding
+        leaking = leaking + leak  # rates per unit time, (*grid): several small leaks add up
+    # relative to all rates of the node, since terms of the drift may cancel up to their rounding
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()
     return grid.some(~lost & ~held & (leaking > limit))

@@ -1,23 +1,23 @@
 """Bounds on the distance from a value function to the exact solution of the discrete equation.
 
-Discounted: with ρ = max(min(r/β, ψ − V), g − V) at every node (zero where held)
+Discounted: with ρ = max(min(r/β, ψ − V), g − V) at every node (zero at fixed nodes)
 
     V + min ρ ≤ V_h ≤ V + max ρ.
 
-Undiscounted with running cost L > 0, exit cost ≥ 0 and V ≥ 0: with L the least running cost at a node,
+Undiscounted, with running cost L > 0, exit cost ≥ 0 and V ≥ 0: with L the least running cost at a node,
 
     V/(1 + η) ≤ V_h ≤ V/(1 − ρ),    ρ = max(r/L)⁺ < 1,   η = max((−r)⁺/L),
 
-because scaling a super- or subsolution scales its generator part and not its cost. Minimum time is L = 1. A
-constant may be added to an undiscounted V: where an exit cost is negative all of it is lifted to zero first. A stopping
-cost ψ changes little: V ≤ ψ is imposed and where V = ψ nothing bounds V_h from above but ψ itself, so that such nodes
-count for η alone.
-A factor 1/(1 − ρ) beyond ε^{-1/2}, ε the unit of rounding, is no bound: its 1 − ρ may be rounding of r and L alone,
-and it says nothing anyway. Both follow from the comparison principle of a monotone scheme; they bound the algebraic
-error and not the error of the grid, hold where the minimum over the actions is exact, and want float64.
+because scaling a super- or subsolution scales its generator term but not its cost. For minimum time L = 1. An
+undiscounted V may be shifted by a constant; if an exit cost is negative, V is first shifted so that all exit costs are
+non-negative. A stopping cost ψ is imposed as V ≤ ψ. Where V = ψ only ψ itself bounds V_h from above, so these nodes
+count for η only. A factor 1/(1 − ρ) beyond ε^{-1/2}, with ε the unit of rounding, is discarded: 1 − ρ may then be
+rounding of r and L, and the bound would be useless. Both bounds follow from the comparison principle of a monotone
+scheme. They bound the algebraic error, not the discretisation error; they are valid if the minimum over the actions is
+exact, and require float64.
 
-An iteration books its progress by them, the least error and residual so far and the steps since either fell, and is
-judged by it.
+An iteration measures its progress by these bounds: the least error and residual so far, and the number of steps since
+either decreased. They determine its status.
 """
 
 import dataclasses
@@ -38,38 +38,38 @@ from hjbjax.solution.status import Status
 
 S = TypeVar("S", bound=Any)
 
-GROWTH = 1e6  # a residual that has grown by this factor over its smallest has diverged
-PATIENCE = 10  # steps without progress of a residual that is rounding
-ROUNDING = 64  # residuals below this many units in the last place of max|V| are rounding
-FEW = 4  # such units: steps by the fastest rate of all, as V alone takes them, are small at a slow node long before
-# Corrections of a scheme of high order are halved, three times at most, where neither of the last two was smaller than
-# all before them and V turned back: that ends limit cycles of the limiter. Halving from the start takes a third more
-# steps, and halving on a slow way to the limit took the Dubins car on 41³ nodes 135 steps in place of 33.
+GROWTH = 1e6  # growth of a residual over its smallest value that means divergence
+PATIENCE = 10  # steps without progress if the residual is rounding
+ROUNDING = 64  # in units in the last place of max|V|: smaller residuals are rounding
+FEW = 4  # the same for value-only iteration, whose steps are small at slow nodes
+# Corrections of a high-order scheme are halved, at most three times, if neither of the last two was smaller than all
+# before them and V turned back. This ends limit cycles of the limiter. Halving from the start takes a third more steps,
+# and halving in slow monotone convergence took the Dubins car on 41³ nodes 135 steps instead of 33.
 LEAST_SHARE, CALM = 0.125, 5
-SLOWEST = 0.95  # rate of contraction beyond which steps say nothing of the distance, and the step counts twentyfold
-LOST = 4  # roundings of numbers of the size lift · max(factor, 1) in factor · V + shift
+SLOWEST = 0.95  # contraction rate beyond which the step size does not measure the distance; it then counts twentyfold
+LOST = 4  # roundings of numbers of size lift · max(factor, 1) in factor · V + shift
 
 
 class Certificate(enum.Enum):
-    """The bound that a problem admits; the value says it in words."""
+    """The bound that a problem admits; the value describes it in words."""
 
     ADDITIVE = "from the discount, V + min r/β ≤ V_h ≤ V + max r/β"
     MULTIPLICATIVE = "from the running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)"
-    BY_DISCOUNT = "from the discount where that is positive, else from the running cost"
+    BY_DISCOUNT = "from the discount where it is positive, else from the running cost"
     RESIDUAL = "the high-order equation, whose residual this is, has no comparison principle"
-    OPEN = "open ends continue the value from inside, and have no comparison principle"
+    OPEN = "open ends extrapolate the value, and have no comparison principle"
     NONE = "without discount and positive running cost the residual bounds nothing"
 
 
 @pytree_dataclass()
 class Moves:
-    """The sizes of the corrections of a scheme of high order, cost units, and what was concluded from them.
+    """The sizes of the corrections of a high-order scheme, cost units, and the resulting damping.
 
     Args:
-      last: the last two, the latest first, as if each was taken whole; infinite where there was none.
-      least: the least one before the last two.
-      share: the part of a correction that is taken.
-      since: steps since ``share`` changed.
+      last: the last two, the latest first, scaled as if each had been taken whole; infinite if there was none.
+      least: the smallest one before the last two.
+      share: the fraction of a correction that is taken.
+      since: number of steps since ``share`` changed.
     """
 
     last: jax.Array
@@ -78,7 +78,7 @@ class Moves:
     since: Scalar
 
 
-TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # of tubes: V falls or climbs until nothing moves
+TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # for tubes, V falls or climbs until nothing moves
 
 
 @pytree_dataclass()
@@ -86,10 +86,10 @@ class ErrorBound:
     """Bounds on V_h − V, and how far they are from V.
 
     Args:
-      below, above: the bounds on V_h: V + shift where additive, (V + lift) · factor − lift where multiplicative.
+      below, above: the bounds on V_h: V + shift if additive, (V + lift) · factor − lift if multiplicative.
       lift: the constant that makes every exit cost non-negative.
-      error: the largest |bound − V| over the nodes that count, cost units; without a certificate the size of the
-        last correction or of the residual.
+      error: the largest |bound − V| over the counted nodes, cost units; without a certificate the size of the last
+        correction or of the residual.
       residual: the largest |residual| in cost units.
     """
 
@@ -105,11 +105,11 @@ class Iterate:
     """A value function with its policy and the residual of its equation.
 
     Attributes:
-      grid: the nodes.
+      grid: the grid.
       value: V, (*grid).
-      policy: the greedy policy at V with its rate r, zero where held.
-      equation: the correction equation there, whose source is the residual.
-      obstacles: held nodes and constraints.
+      policy: the greedy policy at V with its defect r, zero at fixed nodes.
+      equation: its correction equation, whose source is the residual.
+      obstacles: fixed nodes and constraints.
       counted: bool (*grid), the nodes whose error counts (those that reach the target).
     """
 
@@ -127,21 +127,21 @@ def error_bound(
     """The certificate of a value.
 
     Args:
-      kind: which bound applies.
+      kind: the applicable bound.
       iterate: the value, its policy and their residual.
       discount: β.
       least_cost: L at every node, for the multiplicative bound.
-      moved: the size of the last correction, the fallback measure.
+      moved: the size of the last correction, the measure without a certificate.
     """
     if kind is Certificate.BY_DISCOUNT:
         other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
-        # β is traced, so that both bounds are made and one is chosen; r/1 in place of r/0 where it is not
+        # β is traced, so both bounds are computed and one is selected; where β = 0, r/1 replaces r/0
         rate = jnp.where(discount > 0, discount, 1)
         with_it, without = (
             error_bound(each, iterate, discount=rate, least_cost=least_cost, moved=moved)
             for each in (Certificate.ADDITIVE, other)
         )
-        if other is Certificate.NONE:  # bounds that say nothing
+        if other is Certificate.NONE:  # no usable bounds
             endless = jnp.full_like(without.residual, jnp.inf)
             without = dataclasses.replace(without, above=endless, lift=endless)
         return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
@@ -157,17 +157,17 @@ def error_bound(
 
 
 def measured(residual: Scalar, moved: Number) -> ErrorBound:
-    """The error by what is at hand without a bound: the residual, and the size of the last correction."""
+    """The error without a bound, from the residual and the size of the last correction."""
     zero = jnp.zeros_like(residual)
     return ErrorBound(zero, zero, zero, jnp.maximum(residual, moved), residual)
 
 
 def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[Field, ErrorBound]:
-    """The step of one relaxation at a value, zero where that is given, and the bound on the value.
+    """The step of one relaxation at a value, zero at fixed nodes, and the bound on the value.
 
-    The next value is no worse: T is monotone and T V_h = V_h, so that from V − e ≤ V_h ≤ V + e follows
-    T V − e ≤ V_h ≤ T V + e. One array is kept beside V, r where e = max |ρ| is made of it and else s; that is what the
-    barriers are for: without them H is searched once more for every number, or the rates take an array as well.
+    The next value is not worse: T is monotone and T V_h = V_h, so V − e ≤ V_h ≤ V + e implies T V − e ≤ V_h ≤ T V + e.
+    Only one array is stored besides V: r if e = max |ρ| is computed from it, else s. The barriers are needed for this:
+    without them H is evaluated once more for every number, or the rates take an array too.
     """
     (defect, outflow), given = bellman.relaxation(on, value), bellman.obstacles(on)
     zero = jnp.zeros((), value.dtype)
@@ -181,52 +181,52 @@ def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[
 
 
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
-    """min ρ and max ρ of ρ = max(min(r/β, ψ − V), g − V)."""
+    """The minimum and maximum of ρ = max(min(r/β, ψ − V), g − V)."""
     grid, value, policy, obstacles = iterate.grid, iterate.value, iterate.policy, iterate.obstacles
-    if obstacles.upper is None and obstacles.lower is None:  # two reductions first, and no array r/β
+    if obstacles.upper is None and obstacles.lower is None:  # reductions first, without an array r/β
         return grid.least(policy.defect) / discount, grid.largest(policy.defect) / discount
     shift = policy.defect / discount
     if obstacles.upper is not None:
         shift = jnp.minimum(shift, obstacles.upper - value)
     if obstacles.lower is not None:
         shift = jnp.maximum(shift, obstacles.lower - value)
-    # r is zero where held, the obstacles are not: there V is given and exact
+    # at fixed nodes r is zero, the constraints need not be; V is exact there
     shift = jnp.where(obstacles.fixed, 0, shift)
     return grid.least(shift), grid.largest(shift)
 
 
 def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> ErrorBound:
-    """V/(1 + η) ≤ V_h ≤ V/(1 − ρ), of a V lifted until no exit cost is negative."""
+    """V/(1 + η) ≤ V_h ≤ V/(1 − ρ) for V shifted so that no exit cost is negative."""
     value, policy, obstacles, counted = iterate.value, iterate.policy, iterate.obstacles, iterate.counted
     grid, costs = iterate.grid, least_cost > 0
     free = counted & ~obstacles.fixed
-    # where nothing is paid any rate that is left is infinitely much next to the cost; r = 0 makes a NaN of sign · ∞,
-    # and ``priced`` says no there anyway
+    # where L = 0 any defect is infinite relative to the cost; r = 0 gives NaN from sign · ∞, but ``priced`` is false
+    # then anyway
     rate = jnp.where(costs, policy.defect / jnp.where(costs, least_cost, 1), jnp.sign(policy.defect) * jnp.inf)
     relative = jnp.where(free, rate, 0)
-    # where V = ψ nothing bounds V_h from above but ψ, which is imposed
+    # where V = ψ only ψ, which is imposed, bounds V_h from above
     rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
     rho, eta = jnp.maximum(grid.largest(rising), 0), jnp.maximum(grid.largest(-relative), 0)
-    # as numbers: of truth values XLA would make two passes
+    # as numbers: for booleans XLA would make two passes
     priced = grid.largest(jnp.asarray(free & ~costs, value.dtype)) == 0
-    sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # a V flat somewhere has r = L up to rounding
+    sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # where V is flat, r = L up to rounding
     below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
     lift = jnp.maximum(-lowest_end(obstacles, counted, grid), 0)
-    apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # no 0 · inf
+    apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # avoids 0 · inf
     least, most = (grid.least(jnp.where(counted, value, jnp.inf)), grid.largest(jnp.where(counted, value, -jnp.inf)))
-    # the scaling argument wants V ≥ 0; without that there is no bound
+    # the scaling argument requires V ≥ 0; otherwise there is no bound
     bounded = jnp.isfinite(above) & (least + lift >= 0)
-    error = jnp.where(bounded, jnp.maximum(most + lift, 0) * apart, jnp.inf) + 0 * residual  # a NaN stays one
+    error = jnp.where(bounded, jnp.maximum(most + lift, 0) * apart, jnp.inf) + 0 * residual  # keeps NaN
     return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
 
 
 def widened(
     kind: Certificate, bound: ErrorBound, missed: tuple[Field, Field], *, discount: Number, least_cost: Field | None
 ) -> ErrorBound:
-    """The bounds with what the control and the disturbance may miss of their optima, (*grid) each, cost per unit time.
+    """The bounds widened by the errors of the two players' optima, (*grid) each, cost per unit time.
 
-    With H as it was found, min max H is at least H less what the control missed, and at most H and what the disturbance
-    missed, so that r is off by no more.
+    min max H is at least the computed H minus the control's error, and at most H plus the disturbance's error. The
+    error of r is therefore bounded by the same numbers.
     """
     if kind is Certificate.BY_DISCOUNT:
         other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
@@ -240,7 +240,7 @@ def widened(
         below, above = bound.below - jnp.max(mine) / discount, bound.above + jnp.max(theirs) / discount
     elif kind is Certificate.MULTIPLICATIVE:
         assert least_cost is not None
-        # bounds with a free node that pays nothing are endless already
+        # with a free node that pays nothing the bounds are infinite already
         shares = [
             jnp.max(jnp.where(least_cost > 0, each / jnp.where(least_cost > 0, least_cost, 1), 0)) for each in missed
         ]
@@ -252,10 +252,10 @@ def widened(
 
 
 def lowest_end(obstacles: Obstacles, counted: Mask | bool, grid: Grid) -> Scalar:
-    """The least payment at the end of a run, at most zero: exit costs, between nodes as well, and ψ."""
+    """The least payment at the end of a run, at most zero: exit costs, also between nodes, and ψ."""
     lowest = grid.least(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0))
     lowest = jnp.minimum(lowest, obstacles.least_exit)
-    # ψ is paid where one stops, which may be anywhere
+    # ψ is paid on stopping, which is possible anywhere
     return (
         lowest if obstacles.upper is None else jnp.minimum(lowest, grid.least(jnp.where(counted, obstacles.upper, 0)))
     )
@@ -264,8 +264,8 @@ def lowest_end(obstacles: Obstacles, counted: Mask | bool, grid: Grid) -> Scalar
 def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = None) -> Any:
     """Both bounds as affine functions of V: rows lower and upper, columns factor and shift, shape (2, 2).
 
-    (V + lift) · factor − lift cancels where V is near −lift, as on a target with a negative exit cost; the shift is
-    rounded outwards by what that costs. ``None`` without a certificate.
+    (V + lift) · factor − lift cancels where V is near −lift, as on a target with a negative exit cost. The shift is
+    rounded outwards by the possible loss. ``None`` without a certificate.
     """
     if kind is Certificate.BY_DISCOUNT:
         assert discount is not None
@@ -273,7 +273,7 @@ def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = No
         return jnp.where(discount > 0, with_it, without)
     if kind not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
         return None
-    # NumPy where the numbers are known: JAX would round doubles to its default type, and compile
+    # NumPy if the numbers are known: JAX would round doubles to its default type, and compile
     xp: Any = jnp if is_traced(bound) else np
     below, above, lift = (xp.asarray(number) for number in (bound.below, bound.above, bound.lift))
 
@@ -282,7 +282,7 @@ def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = No
         if kind is Certificate.ADDITIVE:
             return xp.stack([one, side])
         endless = xp.isinf(side) | xp.isinf(lift)
-        factor, lifted = xp.where(endless, one, side), xp.where(endless, 0 * one, lift)  # no 0 · inf
+        factor, lifted = xp.where(endless, one, side), xp.where(endless, 0 * one, lift)  # avoids 0 · inf
         lost = LOST * xp.finfo(side.dtype).eps * lifted * xp.maximum(factor, 1) * (factor != 1)
         return xp.stack([factor, xp.where(endless, outwards * xp.inf, lifted * (factor - 1) + outwards * lost)])
 
@@ -290,15 +290,15 @@ def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = No
 
 
 def steps_since_best(state: Any, bound: ErrorBound) -> Scalar:
-    """The steps without progress, this one among them: neither error nor residual is less than ever before."""
+    """The number of steps without progress, including this one: neither error nor residual reached a new minimum."""
     return jnp.where(jnp.any(_measures(bound) < state.best), 0, state.since_best + 1)
 
 
 def moves_after(state: Any, moved: Scalar, turned: jax.Array) -> Moves:
-    """The sizes of the corrections after a step of size ``moved``; a look at a guess is not a step.
+    """The damping after a step of size ``moved``; the evaluation of a guess is not a step.
 
-    Corrections that no longer shrink are halved where they turn back, as in a cycle, and whole again where they go on
-    in one direction, as on a slow way to the limit.
+    Corrections that no longer shrink are halved if they turn back, as in a cycle, and restored if they continue in one
+    direction, as in slow convergence.
     """
     old = state.moves
     whole = moved / old.share
@@ -310,12 +310,12 @@ def moves_after(state: Any, moved: Scalar, turned: jax.Array) -> Moves:
 
 
 def turns_back(grid: Grid, change: Field, defect: Field) -> jax.Array:
-    """True if a correction went too far: where V changed most, its equation now asks for the opposite change.
+    """True if a correction overshot: where V changed most, its equation now requires the opposite change.
 
     Args:
-      grid: the nodes.
-      change: of V in the last step, zero at nodes that do not count, cost units, (*grid).
-      defect: the residual at the new V, positive where V is to rise, cost per unit time, (*grid).
+      grid: the grid.
+      change: the last change of V, zero at nodes that do not count, cost units, (*grid).
+      defect: the residual at the new V, positive where V should increase, cost per unit time, (*grid).
     """
     most = jnp.abs(change) > grid.largest(jnp.abs(change)) / 2
     onwards = jnp.where(most, jnp.sign(change) * defect, 0)
@@ -323,31 +323,31 @@ def turns_back(grid: Grid, change: Field, defect: Field) -> jax.Array:
 
 
 def distance(task: Any, moves: Moves, moved: Scalar, value: Field) -> Scalar:
-    """The distance from V to the limit of its iteration, cost units: step/(1 − ρ), with the measured contraction ρ.
+    """The distance from V to the limit of its iteration, cost units: step/(1 − ρ), with the observed contraction ρ.
 
     Args:
       task: a ``fixed_point.Task``.
       moves: the corrections before the last one.
-      moved: the size of the last one, as it was taken.
-      value: V after it.
+      moved: the size of the last one, as taken.
+      value: V after the last one.
     """
     step, before = moved / moves.share, moves.last
     known = jnp.isfinite(before) & (before > 0)
-    # over one step and over two: two eigenvalues of opposite signs make every other step short
+    # over one step and over two, since two eigenvalues of opposite signs make every other step short
     ratios = jnp.where(known, step / jnp.where(known, before, 1), 0) ** jnp.array([1.0, 0.5], step.dtype)
     rate = jnp.where(jnp.isfinite(before[0]), jnp.max(ratios), SLOWEST)
     rate = jnp.clip(rate, 0, SLOWEST)
-    # steps of the size of rounding do not contract, and lead nowhere
+    # steps of the size of rounding do not contract and do not count
     rounding = FEW * jnp.finfo(value.dtype).eps * _size(task.grid, value, task.counting)
     return moved + jnp.maximum(moved - rounding, 0) * rate / (1 - rate)
 
 
 def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
-    """The status of a ``fixed_point.Task`` after a step; each line overrules those before it."""
+    """The status of a ``fixed_point.Task`` after a step; later lines override earlier ones."""
     longest = task.method.patience(task.grid.whole)
     climbs = task.constrained or task.method.relaxes
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
-    if to_the_end:  # a front moves V by a spacing times its slope a step past every node
+    if to_the_end:  # a front moves V at every node by the spacing times the slope, one step after the other
         longest = jnp.maximum(longest, 100 + 4 * task.grid.whole.size)
 
     def converged(code: Any, tol: Scalar) -> Scalar:
@@ -356,30 +356,30 @@ def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: S
 
     def by_size() -> Scalar:
         rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * _size(task.grid, value, task.counting), task.tol
-        if to_the_end:  # whatever the tolerance
+        if to_the_end:  # regardless of the tolerance
             tol = jnp.where(task.problem.discount > 0, tol, FEW / ROUNDING * rounding if task.bare else rounding)
-        # a residual that is rounding has nowhere to go: ten steps tell, in place of the thousands of a slow climb
+        # a residual that is rounding cannot fall further: ten steps suffice, instead of thousands for a slow climb
         patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
         halted: Any = Status.STALLED
-        if to_the_end and task.bare:  # of many terms more than a few units may remain
+        if to_the_end and task.bare:  # in a sum of many terms more than a few units may remain
             halted = jnp.where((bound.residual <= rounding) & ~(task.problem.discount > 0), Status.CONVERGED, halted)
         code = jnp.where(since >= patience, halted, Status.RUNNING)
         grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
         bounded = jnp.isfinite(best[0]) & (bound.error <= GROWTH * best[0])
-        grew &= ~bounded  # a better policy may leave more than one that stops at once
+        grew &= ~bounded  # a better policy may leave a larger residual than one that stops at once
         return converged(jnp.where(grew, Status.DIVERGED, code), tol)
 
     if to_the_end:
         return by_size()
-    # else the size of V changes no answer; a choice of programs, whose answer the selects that follow do not find anew
+    # otherwise the size of V does not affect the status; a cond, because its result is not recomputed by later selects
     matters = (since >= jnp.minimum(PATIENCE, longest)) | (bound.residual > GROWTH * best[1])
     return jax.lax.cond(matters, by_size, lambda: converged(Status.RUNNING, task.tol))
 
 
 def at_rest(task: Any, state: Any, moved: Scalar, code: Scalar) -> Scalar:
-    """The status after a step; a tube that moved nowhere is at its end, whatever a slow node's residual is.
+    """The status after a step; a tube in which nothing moved has converged, whatever the residual of a slow node.
 
-    That residual is over the node's own rate, and the step over the fastest one: less than the last place of V.
+    The residual is relative to the node's own rate, the step to the fastest rate: it may be below the last place of V.
     """
     if not (task.constrained and task.method.relaxes and task.certificate in TO_THE_END):
         return code
@@ -388,31 +388,31 @@ def at_rest(task: Any, state: Any, moved: Scalar, code: Scalar) -> Scalar:
 
 
 def _size(grid: Grid, value: Field, counted: Mask | bool) -> Scalar:
-    """max |V| over the nodes that count."""
-    if not jnp.ndim(counted):  # all of them: no array of |V|
+    """max |V| over the counted nodes."""
+    if not jnp.ndim(counted):  # all nodes count: no array of |V|
         return jnp.maximum(grid.largest(value), -grid.least(value))
     return grid.largest(jnp.where(counted, jnp.abs(value), 0))
 
 
 def booked(state: S, start: Scalar, bound: ErrorBound, code: Scalar, since: Scalar, **found: Any) -> S:
-    """The state after a step, with what it found; where that is not finite the state before, with the step booked.
+    """The state after a step with its results; if these are not finite, the previous state with the step recorded.
 
     Args:
-      state: before the step, with the books of ``State``.
-      start: the step with which this chunk began.
-      bound: on the error after it.
-      code: the status after it.
-      since: of ``steps_since_best``.
-      found: what else the state holds.
+      state: the state before the step, with the bookkeeping of ``State``.
+      start: the first step of this chunk.
+      bound: the error bound after the step.
+      code: the status after the step.
+      since: the result of ``steps_since_best``.
+      found: other results for the state.
     """
-    # counted and recorded even where it is taken back: ``broken`` makes that step again
+    # counted and recorded even if it is undone: ``broken`` repeats that step
     history = state.history.at[state.step - start].set(bound.residual)
     old = dataclasses.replace(state, step=state.step + 1, since_best=since, code=code, history=history)
-    best = jnp.fmin(state.best, _measures(bound))  # fmin, which a NaN does not win
+    best = jnp.fmin(state.best, _measures(bound))  # fmin ignores NaN
     new = dataclasses.replace(old, bound=bound, best=best, **found)
     return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
 
 
 def _measures(bound: ErrorBound) -> jax.Array:
-    """Error and residual, (2,): less of either is progress."""
+    """Error and residual, (2,): a decrease of either is progress."""
     return jnp.stack([bound.error, bound.residual])

@@ -1,6 +1,6 @@
-"""Evaluating a policy, as values: solving δ = s + Σ_o w_o δ(x + o), and how to write an evaluation of your own.
+"""Methods of policy evaluation, as values, which solve δ = s + Σ_o w_o δ(x + o), and a guide to custom ones.
 
-``PolicyIteration`` and ``Implicit`` take any object of a class derived from ``Evaluation``. Evaluation by GMRES:
+``PolicyIteration`` and ``Implicit`` accept any object of a class derived from ``Evaluation``. Evaluation by GMRES:
 
     >>> import dataclasses
     >>> import jax
@@ -24,7 +24,7 @@
     >>> hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)), method=hjb.PolicyIteration(Gmres())).status.name
     'CONVERGED'
 
-The object enters compiled programs as a pytree, here one without numbers, and ``solve`` is traced.
+The object enters compiled programs as a pytree, here without numbers, and ``solve`` is traced.
 """
 
 import abc
@@ -43,54 +43,55 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Number, Scalar
 
-OPEN_FRACTION = 1e-8  # of the residual, to which a Krylov method goes with open ends
+OPEN_FRACTION = 1e-8  # fraction of the residual to which a Krylov method reduces it with open ends
 
 
 class Evaluation(abc.ABC):
     """The base class of evaluations: solvers of the linear equation of a policy, registered with JAX as pytrees.
 
-    An evaluation defines ``solve``; everything else has a default, given here.
+    An evaluation defines ``solve``; everything else has a default.
     """
 
     @property
     def rough(self) -> bool:
-        """True if it only relaxes: a step is cheap, and the loop changes to a linear solve where it stalls.
+        """True if it only relaxes: steps are cheap, and the loop switches to a linear solve if it stalls.
 
-        The residual of other evaluations is checked, and where they fail, as for a policy without a value, the
-        equation is relaxed.
+        For other evaluations the residual is checked. If they fail, for example for a policy without a value, the
+        equation is relaxed instead.
         """
         return False
 
     @property
     def open_ends(self) -> bool:
-        """True if it solves equations that continue a value beyond open ends from the nodes inside."""
+        """True if it solves equations that extrapolate the value beyond open ends from the inner nodes."""
         return False
 
     @property
     def calls_back(self) -> bool:
-        """True if it runs Python on the host in the middle of a compiled program."""
+        """True if it calls Python on the host from a compiled program."""
         return False
 
     @property
     def in_parts(self) -> bool:
-        """True if it reads other nodes through ``stencil`` and reduces through the grid only, as many devices need."""
+        """True if it accesses other nodes only through ``stencil`` and the grid, so nodes can be divided."""
         return False
 
     @abc.abstractmethod
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
-        """δ with δ = s + Σ_o w_o δ(x + o), exactly or roughly, (*grid), in the type of the equation."""
+        """δ with δ = s + Σ_o w_o δ(x + o), exactly or approximately, (*grid), in the dtype of the equation."""
 
     def bytes_per_node(self, weights: int, word: int) -> int:
-        """Its memory per node, input included, for ``weights`` jumps of ``word`` bytes each."""
+        """Memory per node in bytes, input included, for ``weights`` jumps of ``word`` bytes each."""
         return word * (2 * weights + 8)
 
 
 @pytree_dataclass(static=("count",))
 class Sweeps(Evaluation):
-    """Rough evaluation by Gauss–Seidel: in every order ``count`` times a forward and a backward sweep.
+    """Approximate evaluation by Gauss–Seidel: ``count`` forward and backward sweeps in every order of the axes.
 
-    The work is about that of ``count`` 2^n relaxations of every node. Runs in float32 on the correction. On a CPU whose
-    cache the grid outgrows, every slab of it is swept 2 ``count`` - 1 times (three at least) on each of two ways.
+    The work is about equal to ``count`` 2^n relaxations of every node. Runs in float32 on the correction. If the grid
+    exceeds the cache of a CPU, each slab of it is swept 2 ``count`` - 1 times (at least three) in each of two
+    directions.
     """
 
     count: int = 3
@@ -101,13 +102,13 @@ class Sweeps(Evaluation):
 
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """Rounds of Gauss–Seidel in single precision."""
-        # half the memory; a rough correction holds few digits anyway, and V + δ is made in those of V
+        # saves half the memory; a rough correction has few digits anyway, and V + δ is computed in the dtype of V
         single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), equation)
         return relaxed(single, grid, self.count).astype(equation.source.dtype)
 
     def bytes_per_node(self, weights: int, word: int) -> int:
-        """Weights and source twice in single precision, as they are and sheared."""
-        return 4 * (2 * weights + 2) + 2 * word  # and the equation's source and δ in their own type
+        """Weights and source twice in single precision, plain and skewed."""
+        return 4 * (2 * weights + 2) + 2 * word  # plus the equation's source and δ in their own dtype
 
 
 @pytree_dataclass(static=("max_steps",))
@@ -116,7 +117,7 @@ class Krylov(Evaluation):
 
     Args:
       fraction: stop when the 2-norm of the residual has fallen by this factor.
-      max_steps: at most so many steps, two products and two preconditionings each.
+      max_steps: largest number of steps, with two products and two preconditionings each.
     """
 
     fraction: Number = 1e-3
@@ -137,7 +138,7 @@ class Krylov(Evaluation):
             return relaxed(PolicyEquation(residual, equation.weights), grid, 1)
 
         fraction = self.fraction
-        if grid.sides("open"):  # at 1e-3 the errors of the solves led a step in time to another solution
+        if grid.sides("open"):  # with 1e-3 the errors of the solves led a time step to another solution
             fraction = jnp.minimum(fraction, OPEN_FRACTION)
         return bicgstab(matvec, precondition, equation.source, grid, fraction=fraction, most=self.max_steps)
 
@@ -148,33 +149,33 @@ class Krylov(Evaluation):
 
 @pytree_dataclass()
 class Direct(Evaluation):
-    """Exact evaluation by a sparse LU factorisation (SciPy's SuperLU, on the host): small grids and oracles."""
+    """Exact evaluation by a sparse LU factorisation (SciPy's SuperLU, on the host): for small grids and references."""
 
     open_ends, calls_back = True, True
 
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
-        """By factorisation."""
+        """Solve by factorisation."""
         return direct(equation, grid)
 
     def bytes_per_node(self, weights: int, word: int) -> int:
-        """The weights twice, without the fill of the factors on the host: that depends on the order of the nodes."""
+        """The weights twice, without the fill-in of the factors on the host, which depends on the ordering."""
         return word * (2 * weights + 4)
 
 
 def check_evaluation(evaluation: object, name: str) -> None:
-    """Refuse, by ``name``, anything that is no evaluation of a policy.
+    """Refuse, by ``name``, an object that is not an evaluation of a policy.
 
     Raises:
-      TypeError: with the evaluations that there are.
+      TypeError: lists the available evaluations.
     """
     check_choice(evaluation, Evaluation, name, "hjb.Sweeps(...), hjb.Krylov(...) or hjb.Direct()")
 
 
 def check_choice(value: object, base: type, name: str, wanted: str) -> None:
-    """Refuse, by ``name``, a value of a class that is not derived from ``base``, or that JAX takes for a leaf.
+    """Refuse, by ``name``, a value whose class is not derived from ``base``, or that JAX treats as a leaf.
 
     Raises:
-      TypeError: with the choices that are ``wanted``, or how to make a pytree of a class.
+      TypeError: lists the choices in ``wanted``, or explains how to make the class a pytree.
     """
     if not isinstance(value, base):
         own = f"an object of a class derived from {base.__module__}.{base.__name__}"
@@ -183,14 +184,14 @@ def check_choice(value: object, base: type, name: str, wanted: str) -> None:
 
 
 def check_pytree(value: object, name: str) -> None:
-    """Refuse, by ``name``, a value that JAX takes for a leaf.
+    """Refuse, by ``name``, a value that JAX treats as a leaf.
 
     Raises:
-      TypeError: with the decorators that make a pytree of a class.
+      TypeError: names the decorators that make a class a pytree.
     """
     if any(leaf is value for leaf in jax.tree.leaves(value)):
         raise TypeError(
-            f"{name}: {type(value).__name__} is no pytree, which compiled programs want; decorate the class with "
+            f"{name}: {type(value).__name__} is not a pytree, as compiled programs require; decorate the class with "
             "jax.tree_util.register_static, or register_dataclass if it holds numbers"
         )
 
@@ -199,19 +200,19 @@ def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:
     """An approximate solution δ, shape (*grid), in the dtype of the equation."""
     if grid.sides("open") and not method.open_ends:
         raise ValueError(
-            f"{type(method).__name__}(...) relax node by node, which does not converge where open ends continue the "
-            "value from inside; use hjb.PolicyIteration(hjb.Direct()) or Krylov(), in a march Implicit(hjb.Direct())"
+            f"{type(method).__name__}(...) relaxes node by node, which does not converge with open ends; "
+            "use hjb.PolicyIteration(hjb.Direct()) or Krylov(), in a march Implicit(hjb.Direct())"
         )
     delta = method.solve(equation, grid)
-    if method.rough:  # its residual is looked at in the next step anyway
+    if method.rough:  # its residual is checked in the next step
         return delta
     size, left = grid.largest(jnp.abs(equation.source)), grid.largest(jnp.abs(left_over(equation, grid, delta)))
-    # an improper policy has no value, and BiCGStab may break down: then relax, which always makes sense
+    # an improper policy has no value, and BiCGStab may break down; relaxation is always safe
     return jax.lax.cond(left <= size, lambda: delta, lambda: relaxed(equation, grid, 2))
 
 
 def left_over(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
-    """s + Σ_o w_o δ(x + o) − δ: the residual that a correction leaves."""
+    """s + Σ_o w_o δ(x + o) − δ, the residual of a correction."""
     jumps = zip(equation.weights.offsets, equation.weights.values, strict=True)
     if grid.sides("open"):
         terms = [w * stencil.continued(delta, grid, offset, change=True) for offset, w in jumps]
@@ -229,17 +230,17 @@ def bicgstab(
     fraction: Number,
     most: int,
 ) -> Field:
-    """x with A x = source from zero by preconditioned BiCGStab, its products of vectors taken over all devices.
+    """Solve A x = source by preconditioned BiCGStab from zero, with scalar products over all devices.
 
-    H. A. van der Vorst, SIAM J. Sci. Stat. Comput. 13. JAX's own would add up the nodes of one device alone.
+    H. A. van der Vorst, SIAM J. Sci. Stat. Comput. 13. JAX's own version would sum over the nodes of one device only.
 
     Args:
       matvec: A.
-      precondition: about A⁻¹.
+      precondition: approximately A⁻¹.
       source: the right-hand side, (*grid).
-      grid: the nodes.
-      fraction: of the 2-norm of the source, to which that of the residual is to fall.
-      most: steps.
+      grid: the grid.
+      fraction: the target for the 2-norm of the residual, relative to the source.
+      most: largest number of steps.
     """
 
     def dot(a: Field, b: Field) -> Scalar:
@@ -265,7 +266,7 @@ def bicgstab(
         omega = dot(turned, half) / dot(turned, turned)
         x = x + alpha * towards + jnp.where(done, 0, omega) * across
         residual = jnp.where(done, half, half - omega * turned)
-        # a negative count: it broke down, and goes no further
+        # a negative count means breakdown and ends the loop
         count = jnp.where((omega == 0) | (alpha == 0) | (new == 0), -1, count + 1)
         return x, residual, (alpha, omega, new), direction, moved, count
 
@@ -275,29 +276,29 @@ def bicgstab(
 
 
 def jacobi(equation: PolicyEquation, grid: Grid, sweeps: int) -> Field:
-    """Damped Jacobi sweeps, ½(I + T): the star stencil alone has an eigenvalue near −1."""
+    """Damped Jacobi sweeps with ½(I + T), since the star stencil has an eigenvalue near −1."""
 
-    def sweep(_, delta):  # by half: I − W has eigenvalues up to 2, which a whole step would turn round for ever
+    def sweep(_, delta):  # half a step: I − W has eigenvalues up to 2, for which a whole step would oscillate
         return delta + 0.5 * left_over(equation, grid, delta)
 
     return jax.lax.fori_loop(0, sweeps, sweep, jnp.zeros_like(equation.source))
 
 
 def relaxed(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
-    """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi where diagonal jumps break the wavefront.
+    """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi if diagonal jumps break the wavefront.
 
-    At open ends the correction is continued as a constant: of an equation with a parabola beyond them this is a
-    preconditioner and no solver, since what is outside is told by the change of δ inside.
+    At open ends the correction is extrapolated as a constant. For an equation with a parabola beyond them this is a
+    preconditioner, not a solver, since the values outside depend on δ inside.
     """
     equation = _walled(equation, grid)
-    # a diagonal jump may stay on its hyperplane i₀ + i₁ + … = const, whose nodes are updated at once
+    # a diagonal jump may stay on its hyperplane i₀ + i₁ + … = const, whose nodes are updated simultaneously
     if any(sum(map(abs, offset)) > 1 for offset in equation.weights.offsets):
         return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)  # four for each relaxation of a round
     return gauss_seidel.sweep(equation, grid, rounds)
 
 
 def _walled(equation: PolicyEquation, grid: Grid) -> PolicyEquation:
-    """The equation without weights that lead out of open ends, whose share is the node's own."""
+    """The equation with the weights that leave across open ends added to the node itself."""
     if not grid.sides("open"):
         return equation
     inside, outside = [], jnp.zeros_like(equation.source)
@@ -308,16 +309,16 @@ def _walled(equation: PolicyEquation, grid: Grid) -> PolicyEquation:
                 leaves = leaves | stencil.on_edge(grid, axis, step)
         inside.append(jnp.where(leaves, 0, w))
         outside = outside + jnp.where(leaves, w, 0)
-    # δ = s + w_in δ_in + w_out δ, solved for the node's own δ; a node that only leads out keeps its row
+    # δ = s + w_in δ_in + w_out δ, solved for the node's δ; a node with only outward weights keeps its row
     scale = 1 / jnp.where(outside < 1, 1 - outside, 1)
     weights = dataclasses.replace(equation.weights, values=tuple(scale * w for w in inside))
     return PolicyEquation(scale * equation.source, weights)
 
 
 def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) -> Field:
-    """(I − W)⁻¹ s, or its transpose times s, by SuperLU through a host callback; a batch goes lane after lane.
+    """(I − W)⁻¹ s, or with the transpose, by SuperLU through a host callback; batches run sequentially.
 
-    Numbers travel as 32-bit words: the callback's thread does not know of ``jax.enable_x64``.
+    Numbers are passed as 32-bit words, because ``jax.enable_x64`` does not apply in the callback's thread.
     """
     dtype = equation.source.dtype
     offsets, weights = stencil.inward(equation.weights.offsets, equation.weights.values, grid)
@@ -330,10 +331,10 @@ def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) ->
         delta = factor_and_solve(offsets, [numbers(w) for w in weights], numbers(source), grid, transposed)
         return np.ascontiguousarray(delta.astype(dtype)).view(word).reshape(source.shape)
 
-    # a double is two words on one more axis, a single is one
+    # a double is two words on an additional axis, a single is one word
     words = [jax.lax.bitcast_convert_type(array, word) for array in (equation.source, *weights)]
     result = jax.ShapeDtypeStruct(words[0].shape, word)
-    # a callback, since XLA has no sparse LU; lane after lane, since SuperLU factors one matrix at a time
+    # a callback, since XLA has no sparse LU; sequential, since SuperLU factors one matrix at a time
     delta = jax.pure_callback(on_host, result, *words, vmap_method="sequential")
     return jax.lax.bitcast_convert_type(delta, dtype)
 
@@ -345,13 +346,13 @@ def factor_and_solve(
     grid: Grid,
     transposed: bool = False,
 ) -> np.ndarray:
-    """δ of (I − W) δ = s, or of its transpose; NaN where the matrix is singular."""
+    """Solve (I − W) δ = s, or its transpose; NaN if the matrix is singular."""
     from scipy.sparse.linalg import splu
 
     # I − W with the nodes in C order; CSC is what SuperLU factors
     matrix = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid)
     try:
         delta = splu(matrix.tocsc()).solve(source.ravel(), "T" if transposed else "N")
-    except RuntimeError:  # exactly singular, as a policy that never ends without discount; NaN, which a solve sees
+    except RuntimeError:  # exactly singular, such as an improper policy; the solve detects the NaN
         delta = np.full(grid.size, np.nan)
     return delta.reshape(grid.shape)

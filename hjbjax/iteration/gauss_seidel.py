@@ -1,19 +1,20 @@
-"""Gauss–Seidel as a wavefront: δ(x) ← s(x) + Σ_o w_o(x) δ(x + o), node after node, a plane of nodes at a time.
+"""Wavefront Gauss–Seidel: δ(x) ← s(x) + Σ_o w_o(x) δ(x + o), one hyperplane of nodes at a time.
 
-Under the star stencil the nodes on a hyperplane i₀ + i₁ + … = const do not depend on each other. The arrays are
-sheared cyclically along the first axis,
+For the star stencil the nodes on a hyperplane i₀ + i₁ + … = const do not depend on each other. The arrays are skewed
+cyclically along the first axis,
 
     S[d, j] = X[(d − Σ_k j_k) mod n₀, j],
 
-so that such a hyperplane is one slice S[d] (several, folded); its neighbours stand in S[d − 1] and S[d + 1], one
-entry to the side for the axes beyond the first. A forward sweep goes through the slices upwards, a backward one
-downwards, and flipping axes beyond the first before shearing gives all 2ⁿ orders. What comes across the seam of a
-periodic axis beyond the first is as old as the last sweep.
+so that such a hyperplane is one slice S[d] (or several, folded). Its neighbours are in S[d − 1] and S[d + 1], shifted
+by one entry for the axes beyond the first. A forward sweep goes through the slices upwards, a backward sweep downwards,
+and flipping axes beyond the first before skewing gives all 2ⁿ orders. Values across the seam of a periodic axis beyond
+the first are from the previous sweep.
 
-Where the arrays outgrow a processor's cache, slabs of slices take the place of single sweeps through all of them.
+If the arrays exceed a processor's cache, slabs of slices are swept several times instead of all slices once.
 
-Over many devices each sweeps its own nodes: block Jacobi between the parts. The arrays of a part have one more layer
-beside a divided axis, rows without weights whose source is the δ beyond, fetched before every pair of sweeps.
+With several devices, each sweeps its own nodes: block Jacobi between the parts. The arrays of a part have an additional
+layer next to a divided axis, with rows without weights whose source is the δ beyond, fetched before every pair of
+sweeps.
 """
 
 import dataclasses
@@ -32,28 +33,28 @@ from hjbjax.problem.parts import Parts
 from hjbjax.problem.types import Field, Scalar
 
 Index: TypeAlias = int | Scalar  # of a slice; traced inside a loop
-Weights = list[tuple[jax.Array, ...]]  # for each axis, as ``_towards`` gives them
+Weights = list[tuple[jax.Array, ...]]  # for each axis, as returned by ``_towards``
 
-CACHE = 2**25  # bytes that a processor keeps near by
-SLAB = 64  # slices that are swept to and fro while they are in the cache
-KNOWN: Any = {"mode": "promise_in_bounds", "unique_indices": True}  # of places made by construction
-FURTHER = 4  # parts along an axis for one more round: with 8 and without them policies took 16 steps in place of 12
-FOLDS = 4  # up to so many comparisons take the place of a division, which XLA would not fuse
+CACHE = 2**25  # bytes of the processor's cache
+SLAB = 64  # slices swept back and forth while they are in the cache
+KNOWN: Any = {"mode": "promise_in_bounds", "unique_indices": True}  # for indices that are valid by construction
+FURTHER = 4  # parts along an axis per extra round: with 8 parts and no extra round, solves took 16 steps, not 12
+FOLDS = 4  # up to this number of comparisons replace a division, which XLA does not fuse
 
 
 def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
-    """Sweeps from zero, in every order ``rounds`` times forward and backward; for jumps along the axes alone.
+    """Sweeps from zero, ``rounds`` times forward and backward in every order; for jumps along the axes only.
 
-    The orders are one loop, so that one program serves them all and its operands are arrays in memory: a fused
-    gather would compute each of their entries on its own.
+    The orders are one loop, so that one program serves them all and its operands are arrays in memory: a fused gather
+    would compute every entry separately.
     """
     layout = _layout(grid)
     equation = _laid_out(equation, layout)
-    # news cross one part a sweep
+    # information crosses one part per sweep
     rounds += max(layout.parts.sizes) // FURTHER if layout.parts else 0
 
     def order(index: jax.Array, delta: jax.Array) -> jax.Array:
-        # one bit an axis beyond the first; forward and backward sweeps are the two ways along the first
+        # one bit per axis beyond the first; forward and backward sweeps are the two directions along the first
         flips = [(index >> axis) & 1 for axis in range(grid.ndim - 1)]
         source = _sheared(equation.source, flips)
         weights = [_towards(equation, layout, axis, flips) for axis in range(grid.ndim)]
@@ -64,7 +65,7 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
         def in_slabs(planes: jax.Array) -> jax.Array:
             return _in_slabs(source, weights, planes, layout, rounds, flips)
 
-        # a margin of one entry beside the axes beyond the first, so that neighbours are slices without a branch
+        # a margin of one entry next to the axes beyond the first, so that neighbours are slices without a branch
         planes = jnp.pad(_sheared(delta, flips), _margins(grid.ndim))
         if _outgrows_the_cache(source, weights):
             planes = jax.lax.platform_dependent(planes, cpu=in_slabs, default=whole)
@@ -79,11 +80,11 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """How the axes of a grid stand in the arrays of a sweep: which of them is the first, and where layers are.
+    """The arrangement of the grid's axes in the arrays of a sweep, and the additional layers.
 
     Attributes:
-      grid: the nodes.
-      axes: those of the grid, in the order of the arrays' axes.
+      grid: the grid.
+      axes: the grid's axes, in the order of the arrays' axes.
     """
 
     grid: Grid
@@ -91,7 +92,7 @@ class Layout:
 
     @property
     def parts(self) -> Parts | None:
-        """The parts of the nodes over many devices; None where all are here."""
+        """The parts of the nodes over several devices; None if all nodes are on one device."""
         return self.grid.parts
 
     def is_divided(self, axis: int) -> bool:
@@ -99,12 +100,12 @@ class Layout:
         return self.grid.is_divided(self.axes[axis])
 
     def closes(self, axis: int) -> bool:
-        """True if an axis of the arrays is periodic, and all of it here."""
+        """True if an axis of the arrays is periodic and not divided."""
         return bool(self.grid.periodic[self.axes[axis]]) and not self.is_divided(axis)
 
 
 def _layout(grid: Grid) -> Layout:
-    """The axes in their order; where a part is so flat that hyperplanes would be folded often, the longest first."""
+    """The layout with the axes in order; if a part is so flat that hyperplanes would fold often, longest axis first."""
     axes = list(range(grid.ndim))
     if grid.parts is not None and _folds(grid.shape) > FOLDS:
         axes.sort(key=lambda axis: axis != int(np.argmax(grid.shape)))
@@ -112,7 +113,7 @@ def _layout(grid: Grid) -> Layout:
 
 
 def _laid_out(equation: PolicyEquation, layout: Layout) -> PolicyEquation:
-    """The equation with a layer of zeros on both sides of every divided axis; in fillers zeros as well."""
+    """The equation with a layer of zeros on both sides of every divided axis; filler nodes are zeroed too."""
     parts = layout.parts
     if parts is None:
         return equation
@@ -124,11 +125,11 @@ def _laid_out(equation: PolicyEquation, layout: Layout) -> PolicyEquation:
     return jax.tree.map(lay, equation)
 
 
-Carried = tuple[jax.Array, jax.Array]  # planes, and the source, whose layers change from pair to pair
+Carried = tuple[jax.Array, jax.Array]  # planes, and the source, whose layers change between pairs of sweeps
 
 
 def _exchanged(carried: Carried, layout: Layout, flips: list[jax.Array]) -> Carried:
-    """Planes and source with the δ of the nodes beyond this part in the layers around it."""
+    """Planes and source, with the δ of the nodes beyond this part in the layers around it."""
     (planes, source), parts = carried, layout.parts
     for axis in range(source.ndim) if parts is not None else ():
         if not layout.is_divided(axis):
@@ -137,7 +138,7 @@ def _exchanged(carried: Carried, layout: Layout, flips: list[jax.Array]) -> Carr
         along = layout.axes[axis]
         count, cyclic = parts.count(along), bool(layout.grid.periodic[along])
         for step, first, layer in ((1, 1, count + 1), (-1, count, 0)):
-            # what the part beside needs of this one is its node at that end; places count the layer
+            # the adjacent part requires the node of this part at that end; indices count the layer
             given = planes.at[_within(_places(source.shape, axis, first, flips))].get(**KNOWN)
             found, there = parts.fetched(given, along, step, cyclic=cyclic), _places(source.shape, axis, layer, flips)
             planes = planes.at[_within(there)].set(found, **KNOWN)
@@ -146,17 +147,17 @@ def _exchanged(carried: Carried, layout: Layout, flips: list[jax.Array]) -> Carr
 
 
 def _margins(ndim: int) -> list[tuple[int, int]]:
-    """The entries before and behind the nodes of planes along every axis."""
+    """The padding of planes before and after the nodes along every axis."""
     return [(0, 0), *[(1, 1)] * (ndim - 1)]
 
 
 def _within(places: Sequence[Any]) -> tuple[Any, ...]:
-    """Places in sheared arrays as those in planes, which have margins."""
+    """Convert indices into skewed arrays to indices into planes, which have margins."""
     return tuple(place + (axis > 0) for axis, place in enumerate(places))
 
 
 def _places(shape: tuple[int, ...], axis: int, number: Index, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
-    """Where the nodes with one ``number`` along an axis stand in sheared arrays."""
+    """The indices, in skewed arrays, of the nodes with the given ``number`` along an axis."""
     sizes = [1 if k == axis else size for k, size in enumerate(shape)]
     row, *columns = (
         jax.lax.broadcasted_iota(jnp.int32, sizes, k) + (number if k == axis else 0) for k in range(len(shape))
@@ -169,20 +170,20 @@ def _places(shape: tuple[int, ...], axis: int, number: Index, flips: list[jax.Ar
 
 
 def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
-    """True if all slices outgrow a processor's cache and a slab of them does not."""
-    arrays = 2 + sum(map(len, weights))  # source and planes beside the weights
+    """True if all slices together exceed a processor's cache and a slab of them does not."""
+    arrays = 2 + sum(map(len, weights))  # source and planes, in addition to the weights
     size = arrays * source.size * source.dtype.itemsize
-    # half of the cache: the slab before and the one after pass through it, too
+    # half of the cache, since the previous and the next slab pass through it too
     return size > CACHE and SLAB * size / len(source) < CACHE / 2
 
 
 def _in_turns(
     source: jax.Array, weights: Weights, planes: jax.Array, layout: Layout, rounds: int, flips: list[jax.Array]
 ) -> jax.Array:
-    """All slices upwards and downwards, ``rounds`` times."""
+    """Sweep all slices upwards and downwards, ``rounds`` times."""
 
     def sweep(k: jax.Array, planes: jax.Array, source: jax.Array = source) -> jax.Array:
-        # one program for both ways
+        # one program for both directions
         return _sweep(source, weights, _wrapped(planes, layout), 0, len(source), up=k % 2 == 0)
 
     def pair(_: Index, carried: Carried) -> Carried:
@@ -197,10 +198,10 @@ def _in_turns(
 def _in_slabs(
     source: jax.Array, weights: Weights, planes: jax.Array, layout: Layout, rounds: int, flips: list[jax.Array]
 ) -> jax.Array:
-    """Slab after slab upwards and once more downwards; each to and fro while it is in the cache.
+    """Sweep slab after slab upwards and then downwards, each slab back and forth while it is in the cache.
 
-    What lies beyond the cache is read twice instead of 2 ``rounds`` times, and a slab is swept 2 ``rounds`` - 1 times
-    while it is at hand, three at least.
+    Memory beyond the cache is read twice instead of 2 ``rounds`` times. A slab is swept 2 ``rounds`` - 1 times while it
+    is in the cache, at least three times.
     """
     count = len(source)
     slabs = -(-count // SLAB)  # the last one may be shorter
@@ -217,25 +218,25 @@ def _in_slabs(
 
             return jax.lax.fori_loop(0, max(2 * rounds - 1, 3), sweep, planes)
 
-        # margins once a way: filling them between slabs would read all planes
+        # fill the margins once per direction: doing so between slabs would read all planes
         return jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, layout)), source
 
     return jax.lax.fori_loop(0, 2, way, (planes, source))[0]
 
 
 def _towards(equation: PolicyEquation, layout: Layout, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
-    """The sheared weights (up, down) along an axis, or (up − down,) where at most one of the two is positive."""
+    """The skewed weights (up, down) along an axis, or (up − down,) if at most one of the two is positive."""
     table = dict(zip(equation.weights.offsets, equation.weights.values, strict=True))
     up, down = (table[stencil.unit(layout.grid, layout.axes[axis], step)] for step in (1, -1))
     flipped = flips[axis - 1] == 1 if axis else False
-    # one array in place of two halves what a sweep reads, and memory is what it waits for; the sign tells the side
+    # one array instead of two halves the memory traffic, which limits the speed; the sign gives the direction
     if equation.weights.one_way:
         return (_sheared((up - down) * jnp.where(flipped, -1, 1).astype(up.dtype), flips),)
     return _sheared(jnp.where(flipped, down, up), flips), _sheared(jnp.where(flipped, up, down), flips)
 
 
 def _wrapped(planes: jax.Array, layout: Layout) -> jax.Array:
-    """The planes with a margin of values from across the seams of periodic axes beyond the first."""
+    """The planes with margins filled across the seams of periodic axes beyond the first."""
     for axis in range(1, planes.ndim):
         if layout.closes(axis):
             planes = _with_margins(planes, axis)
@@ -243,9 +244,9 @@ def _wrapped(planes: jax.Array, layout: Layout) -> jax.Array:
 
 
 def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
-    """Both margins of an axis filled from its other end; across a seam a hyperplane goes on in another slice.
+    """Fill both margins of an axis from its other end; across a seam a hyperplane continues in another slice.
 
-    In a loop an update is made in place; out of one XLA copies all planes to keep the old ones.
+    In a loop the update is in place; outside, XLA would copy all planes to keep the old ones.
     """
     count = planes.shape[axis] - 2
 
@@ -253,7 +254,7 @@ def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
         above = side == 0
         inner = jax.lax.dynamic_slice_in_dim(planes, jnp.where(above, 1, count), 1, axis)
         start: list[Index] = [0] * planes.ndim
-        # S[d, j] with d − Σ j: a step of a whole axis to the side is as many slices further
+        # S[d, j] with d − Σ j: moving by a whole axis sideways is the same number of slices further
         inner = jnp.roll(inner, jnp.where(above, count, -count), axis=0)
         start[axis] = jnp.where(above, count + 1, 0)
         return jax.lax.dynamic_update_slice(planes, inner, start)
@@ -264,22 +265,22 @@ def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
 def _sweep(
     source: jax.Array, weights: Weights, planes: jax.Array, first: Index, last: Index, *, up: jax.Array
 ) -> jax.Array:
-    """One pass over the slices from ``first`` to ``last``; ``planes`` has margins beside the axes beyond the first."""
+    """One pass over the slices from ``first`` to ``last``; ``planes`` has margins for the axes beyond the first."""
     count = len(source)
 
     def row(values: jax.Array, d: Index) -> jax.Array:
-        # d is never negative: JAX would add a comparison and a select to every start
+        # d is never negative; JAX would add a comparison and a select to every start index
         return jax.lax.dynamic_slice_in_dim(values, d, 1, allow_negative_indices=False)
 
     def core(slab: jax.Array, axis: int, step: int) -> jax.Array:
-        """A slice without its margin, moved by ``step`` along an axis of the grid beyond the first."""
+        """A slice without its margin, shifted by ``step`` along an axis of the grid beyond the first."""
         starts = [1 + step * (k == axis) for k in range(1, source.ndim)]
         cut = (slice(start, start + size) for start, size in zip(starts, source.shape[1:], strict=True))
         return slab[(slice(None), *cut)]
 
     def relax(k: jax.Array, planes: jax.Array) -> jax.Array:
         d = jnp.where(up, k, first + last - 1 - k)
-        # round: behind the last slice comes the first one, across the fold of the shear
+        # cyclic: after the last slice comes the first one, across the fold
         below, above = row(planes, jnp.where(d == 0, count, d) - 1), row(planes, jnp.where(d == count - 1, 0, d + 1))
         new = row(source, d)
         for axis, pair in enumerate(weights):
@@ -287,7 +288,7 @@ def _sweep(
             if len(rows) == 2:
                 new = new + rows[0] * up_there + rows[1] * down_there
             else:
-                # up − down: positive goes up; a negative one goes down by its size
+                # up − down: a positive weight goes up, a negative one goes down
                 new = new + rows[0] * jnp.where(rows[0] > 0, up_there, -down_there)
         start: tuple[Index, ...] = (d, *(1 for _ in source.shape[1:]))
         return jax.lax.dynamic_update_slice(planes, new, start, allow_negative_indices=False)
@@ -296,7 +297,7 @@ def _sweep(
 
 
 def _folds(shape: tuple[int, ...]) -> int:
-    """How often Σ j, which ranges over Σ (n_k − 1), may wrap round the first axis."""
+    """The number of times that Σ j, which ranges over Σ (n_k − 1), may wrap around the first axis."""
     count, *counts = shape
     return -(-(sum(counts) - len(counts)) // count)
 
@@ -308,10 +309,10 @@ def _sheared(values: jax.Array, flips: list[jax.Array]) -> jax.Array:
 
 
 def _from_planes(planes: jax.Array, flips: list[jax.Array]) -> jax.Array:
-    """X of its planes, which have margins.
+    """Recover X from its planes, which have margins.
 
-    The margin is skipped by the places: of its slice without it, fused into the gather, every entry would be looked for
-    by divisions, six times the time.
+    The indices skip the margin. Slicing the margin off first would be fused into the gather, with a division per entry,
+    and take six times as long.
     """
     shape = tuple(size - sum(margin) for size, margin in zip(planes.shape, _margins(planes.ndim), strict=True))
     row, _, flipped = _entries(shape, flips)
@@ -320,8 +321,8 @@ def _from_planes(planes: jax.Array, flips: list[jax.Array]) -> jax.Array:
 
 
 def _entries(shape: tuple[int, ...], flips: list[jax.Array]) -> tuple[jax.Array, list[jax.Array], list[jax.Array]]:
-    """The indices of every entry: along the first axis, along the others, and these from the other end if flipped."""
-    zero, *flips = jax.lax.optimization_barrier((jnp.int32(0), *flips))  # or the loop over the orders keeps indices
+    """The indices of every entry: along the first axis, along the others, and along the others after flipping."""
+    zero, *flips = jax.lax.optimization_barrier((jnp.int32(0), *flips))  # otherwise the loop stores indices
     row, *columns = (jax.lax.broadcasted_iota(jnp.int32, shape, axis) + zero for axis in range(len(shape)))
     flipped = [
         jnp.where(flip == 1, size - 1 - column, column)
@@ -331,7 +332,7 @@ def _entries(shape: tuple[int, ...], flips: list[jax.Array]) -> tuple[jax.Array,
 
 
 def _folded(place: jax.Array, shape: tuple[int, ...], *, back: bool) -> jax.Array:
-    """A place along the sheared axis modulo n₀: from below if the columns were subtracted, ``back`` from above."""
+    """An index along the skewed axis modulo n₀: from below if columns were subtracted, with ``back`` from above."""
     count, folds = shape[0], _folds(shape)
     if folds > FOLDS:
         return place % count
@@ -342,7 +343,7 @@ def _folded(place: jax.Array, shape: tuple[int, ...], *, back: bool) -> jax.Arra
 
 
 def _gathered(values: jax.Array, places: list[jax.Array]) -> jax.Array:
-    """The entries of an array at these indices along its axes: one gather from the flat array that clamps nothing."""
+    """The entries of an array at these indices: one gather from the flat array, without clamping."""
     flat, *others = places
     for place, size in zip(others, values.shape[1:], strict=True):
         flat = flat * size + place

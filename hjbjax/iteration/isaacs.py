@@ -1,4 +1,4 @@
-"""How far Isaacs' condition fails on a grid: min max against max min of the Hamiltonian, node by node."""
+"""The violation of Isaacs' condition on a grid: min max minus max min of the Hamiltonian at the nodes."""
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,9 @@ from hjbjax.problem.types import Array, Field, Mask, Scalar
 
 
 def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Mask) -> tuple[Scalar, Scalar]:
-    """The largest min max − max min over the ``free`` nodes, and how much the actions matter there, per unit time.
+    """The largest min max − max min over the ``free`` nodes, and the influence of the actions there, per unit time.
 
-    How much they matter is the largest difference of H between two pairs of them, of nine representatives a player.
+    The influence is the largest difference of H between two pairs of actions, out of nine representatives per player.
     """
     upper, lower = extremes(hamiltonian)
     return gap_between(hamiltonian, free, upper, lower), weight_of_actions(hamiltonian, free, upper, lower)
@@ -31,25 +31,25 @@ def gap_between(hamiltonian: discrete.DiscreteHamiltonian, free: Mask, upper: Fi
 
 
 def weight_of_actions(hamiltonian: discrete.DiscreteHamiltonian, free: Mask, upper: Field, lower: Field) -> Scalar:
-    """How much the actions matter over the ``free`` nodes, per unit time."""
+    """The influence of the actions over the ``free`` nodes, per unit time, see ``isaacs_gap``."""
     problem, dtype = hamiltonian.on.problem, hamiltonian.on.dtype
     sets_of = (problem.controls, problem.disturbances)
     mine, theirs = (jnp.asarray(_representatives(admissible), dtype) for admissible in sets_of)
 
     def compare(extremes: tuple[Field, Field], pair: jax.Array) -> tuple[tuple[Field, Field], None]:
         total = hamiltonian.at(list(mine[pair[0]]), list(theirs[pair[1]]))
-        total = jnp.where(jnp.isfinite(total), total, upper)  # an action that an end of the box rules out
+        total = jnp.where(jnp.isfinite(total), total, upper)  # actions that an end of the box forbids
         return (jnp.minimum(extremes[0], total), jnp.maximum(extremes[1], total)), None
 
     pairs = jnp.asarray([(i, j) for i in range(len(mine)) for j in range(len(theirs))])
-    # one pair at a time: all 81 at once would be 81 arrays of the nodes
+    # one pair at a time: all 81 at once would store 81 arrays
     (least, most), _ = jax.lax.scan(compare, (lower, upper), pairs)
-    size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # no gap is less than rounding
+    size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # a gap is at least rounding
     return hamiltonian.on.grid.largest(jnp.where(free, most - least + size, 0))
 
 
 def _representatives(admissible: AdmissibleSet | None) -> Array:
-    """At most nine actions of a player, shape (K, m), the first and the last of its samples among them."""
+    """At most nine actions of a player, shape (K, m), including the first and the last of its samples."""
     if admissible is None:
         return np.zeros((1, 0))
     points = sets.samples(admissible, 9)

@@ -1,21 +1,21 @@
-"""Methods in time, as values: V at t − Δt from V at t. ``Tableau`` says how to write a Runge–Kutta method of your own.
+"""Methods in time, as values: V at t − Δt from V at t. ``Tableau`` explains custom Runge–Kutta methods.
 
-The discount is integrated exactly, by steps in s with e^{−βτ} = 1 − β s, τ = t₀ − t the time since the step began:
+The discount is integrated exactly by steps in s with e^{−βτ} = 1 − β s, where τ = t₀ − t is the time since the step
+began:
 
-    dV/ds = (min max H − β V)/(1 − β s),
+    dV/ds = (min max H − β V)/(1 − β s).
 
-whose right side is constant where H is, so that any step is exact there, whatever its length. S = (1 − e^{−βΔt})/β is
-the length of a step in s, and Δt without a discount.
+The right side is constant where H is, so any step is exact there. S = (1 − e^{−βΔt})/β is the length of a step in s,
+and Δt without a discount.
 
 Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, with F = dV/ds and S for Δt,
 
     W ← a_k V + (1 − a_k) (W + c Δt F(W)),    a = (0), (0, ½), (0, ¾, ⅓) with c = 1; (0, 0, ⅔, 0) with c = ½,
 
-each stage a mean of Euler steps, so that what one Euler step keeps, they keep: V ← max(g, min(ψ, ·)) and the given
-values after every stage, and for the monotone chain the order of two values and the range of the data, as long as
-c S e^{βΔt} (max Q + β) ≤ 1 with Q the rate at which the chain leaves a node; Euler's step lacks the factor e^{βΔt}.
-Order 1, 2, 3 and 3 in time. A ``Tableau`` of
-one's own goes into ``Explicit(stages=...)``.
+of order 1, 2, 3 and 3 in time. Each stage is a mean of Euler steps and preserves what an Euler step preserves: after
+every stage V ← max(g, min(ψ, ·)) and the prescribed values, and for the monotone chain the order of two values and the
+range of the data, if c S e^{βΔt} (max Q + β) ≤ 1, with Q the rate at which the chain leaves a node. Euler's step does
+not require the factor e^{βΔt}. A custom ``Tableau`` is passed to ``Explicit(stages=...)``.
 
 Implicit (Euler): with V at t known and S' = S e^{βΔt}, W = V(·, t − Δt) solves the stationary problem
 
@@ -44,33 +44,33 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import DType, Field, Number, Numbers, Scalar
 
-ROUNDING = 16  # residuals below this many units in the last place of max|V| are rounding
-TOL = 1e-6  # cost units, for a value that spans one or more
-REPLIES = 20  # of the inner player to one policy of the outer one, at most
+ROUNDING = 16  # in units in the last place of max|V|: smaller residuals are rounding
+TOL = 1e-6  # cost units, for a value whose range is one or more
+REPLIES = 20  # largest number of responses of the inner player to one policy of the outer player
 
 
 def stretched(dt: Number, problem: Problem, dtype: DType) -> Scalar:
-    """(e^{βΔt} − 1)/β, cost units per unit of a constant cost that grows with the discount; Δt without one."""
+    """(e^{βΔt} − 1)/β, the cost of a unit rate over Δt, growing with the discount; Δt without a discount."""
     dt = jnp.asarray(dt, dtype)
     if problem.discounted is False:
         return dt
     discount = jnp.asarray(problem.discount, dtype)
     some = discount > 0
-    # the inner where keeps 0/0 out of the branch not taken, whose NaN a derivative would bring back
+    # the inner where keeps 0/0 out of the branch not taken, whose NaN would enter the derivative
     return jnp.where(some, jnp.expm1(discount * dt) / jnp.where(some, discount, 1), dt)
 
 
 def longest_step(rate: Scalar, problem: Problem, share: Numbers, tableau: "Tableau") -> jax.Array:
-    """The longest step whose Euler steps are monotone if ``share`` is 1/c; inf where nothing moves.
+    """The longest step whose Euler steps are monotone if ``share`` is 1/c; inf if nothing moves.
 
     Args:
       rate: the largest Q + β, per unit time.
       problem: with the discount β.
-      share: the step over 1/(max Q + β), of a small discount; one or several.
+      share: the step in units of 1/(max Q + β), for a small discount; one or several.
       tableau: the stages.
     """
     moves = rate > 0
-    # the inner where keeps 1/0 out of the branch not taken, whose NaN a derivative would bring back
+    # the inner where keeps 1/0 out of the branch not taken, whose NaN would enter the derivative
     step = jnp.where(moves, share / jnp.where(moves, rate, 1), jnp.inf)
     if problem.discounted is False or len(tableau.means) == 1:
         return step
@@ -80,7 +80,7 @@ def longest_step(rate: Scalar, problem: Problem, share: Numbers, tableau: "Table
 
 
 class Marching(Protocol):
-    """A march, as its method sees it."""
+    """The view of a march that is passed to its method."""
 
     @property
     def on(self) -> Discretisation:
@@ -94,28 +94,27 @@ class Marching(Protocol):
         """Fixed nodes and constraints at the time t."""
 
     def rate(self, value: Field, t: Number) -> tuple[Field, Any]:
-        """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
+        """F = min max H − β V, cost per unit time, with the rates and the noise under the optimal actions."""
 
     def look(self, value: Field, u: list, d: list, t: Number) -> Any:
         """The fastest rate under these actions, noise that the chain cannot represent, and drift that is cut off."""
 
     def nothing_seen(self) -> Any:
-        """The outcome before the first look."""
+        """The outcome before the first evaluation."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Tableau:
-    """An explicit Runge–Kutta method made of Euler steps: W ← a_k V + (1 − a_k) (W + c Δt F(W)), from W = V on.
+    """An explicit Runge–Kutta method made of Euler steps: W ← a_k V + (1 − a_k) (W + c Δt F(W)), starting at W = V.
 
-    Such a method is strong-stability preserving with steps 1/c times as long as Euler's. Its order is for who writes it
-    to know.
+    Such a method is strong-stability preserving with steps 1/c times as long as Euler's. Its order is not checked.
 
     Args:
-      means: a_k, the share of V in the result of every stage, from 0 to below 1.
-      euler: c, the length of the Euler steps over that of the whole one.
+      means: a_k, the weight of V in the result of every stage, from 0 to below 1.
+      euler: c, the length of the Euler steps relative to the whole step.
 
     Raises:
-      ValueError: shares or a length out of range, or stages that do not end at the end of the step.
+      ValueError: weights or length are out of range, or the stages do not end at the end of the step.
 
     Example:
       >>> Tableau((0.0, 0.0, 1 / 3), 1 / 2).times  # of second order, with steps twice as long as Euler's
@@ -128,17 +127,18 @@ class Tableau:
     def __post_init__(self):
         object.__setattr__(self, "means", tuple(map(float, self.means)))
         if not self.means or not all(0 <= share < 1 for share in self.means):
-            raise ValueError(f"Tableau: got means = {self.means!r}, wanted one number a stage, from 0 to below 1")
+            raise ValueError(f"Tableau: got means = {self.means!r}, wanted one number per stage, from 0 to below 1")
         arguments.positive(self.euler, "Tableau: euler", most=1)
         if self.times[-1] != 1:
             raise ValueError(f"Tableau: the last stage ends at {self.times[-1]:g} of a step, wanted 1: see .times")
 
     @property
     def times(self) -> tuple[float, ...]:
-        """The times at which the stages evaluate F, and the end of the last one, in steps."""
+        """The times at which the stages evaluate F, and the end of the last stage, in units of the step."""
         found = [0.0]
         for share in self.means:
-            # 1/3 and 2/3 are no binary numbers: at 12 digits the last stage of a sound tableau ends at 1 exactly
+            # 1/3 and 2/3 are not binary fractions: rounded to 12 digits the last stage of a valid tableau ends exactly
+            # at 1
             found.append(round((1 - share) * (found[-1] + self.euler), 12))
         return tuple(found)
 
@@ -152,9 +152,9 @@ TABLEAUX = {
 
 
 class TimeMethod(abc.ABC):
-    """The base class of methods that carry V from t to t − Δt; registered with JAX as pytrees.
+    """The base class of methods that advance V from t to t − Δt; registered with JAX as pytrees.
 
-    A method defines ``step``; everything else has a default, given here.
+    A method defines ``step``; everything else has a default.
     """
 
     @property
@@ -169,39 +169,39 @@ class TimeMethod(abc.ABC):
 
     @property
     def tableau(self) -> Tableau:
-        """Its stages: the times within a step at which the rates are evaluated."""
+        """Its stages, that is, the times within a step at which rates are evaluated."""
         return TABLEAUX[1]
 
     @property
     def monotone_only(self) -> bool:
-        """True if it needs the matrix of a chain, and so a monotone scheme."""
+        """True if it uses the matrix of a chain, and so requires a monotone scheme."""
         return False
 
     @property
     def evaluation(self) -> Evaluation | None:
-        """The solver of the equation of a policy; None if the method solves none, or if the problem decides."""
+        """The solver for the equation of a policy; None if the method does not solve any, or if the problem decides."""
         return None
 
     @property
     def tol(self) -> Number | None:
-        """A bound on what the steps of a march leave unsolved, in cost units; None for the default."""
+        """A bound on the sum of the steps' algebraic errors over a march, in cost units; None for the default."""
         return None
 
     @property
     def in_parts(self) -> bool:
-        """True if ``step`` reads other nodes through ``stencil`` only, as many devices need."""
+        """True if ``step`` reads other nodes through ``stencil`` only, so that devices can share the nodes."""
         return False
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "TimeMethod":
-        """The method with its open settings taken from the scheme and from the ``evaluation`` of the problem."""
+        """The method with open settings taken from the scheme and from the ``evaluation`` for the problem."""
         return self
 
     @abc.abstractmethod
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` = t − Δt from V at t, true if the step came to its end, and the rates and the noise seen."""
+        """V at ``end`` = t − Δt from V at t, true if the step succeeded, and the rates and the noise."""
 
     def described(self) -> str:
-        """The method as one would write it."""
+        """The method as source text."""
         return repr(self)
 
 
@@ -211,9 +211,9 @@ class Explicit(TimeMethod):
 
     Args:
       stages: 1 (Euler), 2 or 3, which is also the order in time; 4, of order 3 with steps twice as long, which takes
-        two thirds of the evaluations of 3; a ``Tableau`` of your own; or ``None`` for what goes with the scheme: 1 for
+        two thirds of the evaluations of 3; a custom ``Tableau``; or ``None`` for the choice of the scheme: 1 for
         ``Upwind``, 3 for ``Weno5``, else 2.
-      fraction: the length of a step over the stability limit, 1/(max Q + β) or twice that with 4 stages; at most 1.
+      fraction: the step in units of the stability limit, 1/(max Q + β) or twice that with 4 stages; at most 1.
     """
 
     stages: int | Tableau | None = None
@@ -221,7 +221,7 @@ class Explicit(TimeMethod):
     limited, in_parts = True, True
 
     def __post_init__(self):
-        # True is 1 to Python, and would be taken for Euler's method
+        # True equals 1 in Python, and would select Euler's method
         named = not isinstance(self.stages, bool) and self.stages in (None, *TABLEAUX)
         if not named and not isinstance(self.stages, Tableau):
             raise ValueError(f"Explicit: got stages = {self.stages!r}, wanted 1, 2, 3, 4, a Tableau or None")
@@ -229,7 +229,7 @@ class Explicit(TimeMethod):
 
     @property
     def tableau(self) -> Tableau:
-        """The method of the stages; they must be known."""
+        """The tableau of the stages, which must not be open."""
         assert self.stages is not None
         return self.stages if isinstance(self.stages, Tableau) else TABLEAUX[self.stages]
 
@@ -239,14 +239,14 @@ class Explicit(TimeMethod):
         return self.fraction / self.tableau.euler
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Explicit":
-        """The method with the stages that go with the scheme, if none were asked for; its numbers in the type."""
+        """The method with the stages of the scheme, if its own are open; its numbers in the dtype of the march."""
         return Explicit(self.stages or on.scheme.stages, _as(self.fraction, on.dtype))
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` = t − Δt from V at t by the stages of the tableau, true, and the rates and the noise seen."""
+        """V at ``end`` = t − Δt from V at t by the stages of the tableau, true, and the rates and the noise."""
         dtype, tableau, fine = value.dtype, self.tableau, jnp.ones((), bool)
         length = -stretched(-dt, march.on.problem, dtype)  # S
-        if len(tableau.means) == 1:  # Euler: no loop of one turn
+        if len(tableau.means) == 1:  # Euler: avoids a loop with one iteration
             rate, seen = march.rate(value, t)
             return march.obstacles_at(t - dt).impose(value + length * rate), fine, seen
         means, starts, ends = (
@@ -257,17 +257,17 @@ class Explicit(TimeMethod):
             w, seen = carry
             begun, factor = _elapsed(march.on.problem, starts[k], length, dt)
             rate, now = march.rate(w, t - begun)
-            # a mean of V and of one Euler step with weights ≥ 0: what Euler's step keeps, this keeps
+            # a mean of V and an Euler step with weights ≥ 0 preserves what an Euler step preserves
             moved = means[k] * value + (1 - means[k]) * (w + tableau.euler * length * factor * rate)
             ended, _ = _elapsed(march.on.problem, ends[k], length, dt)
             return march.obstacles_at(t - ended).impose(moved), seen.joined(now)
 
-        # a loop, so that the slopes are compiled once and not once a stage
+        # a loop, so that the slopes are compiled once instead of once per stage
         value, seen = jax.lax.fori_loop(0, len(tableau.means), stage, (value, march.nothing_seen()))
         return value, fine, seen
 
     def described(self) -> str:
-        """The method as one would write it."""
+        """The method as source text."""
         return f"Explicit(stages={self.stages}, fraction={float(self.fraction):g})"
 
 
@@ -276,10 +276,10 @@ class Implicit(TimeMethod):
     """Implicit Euler steps, each by policy iteration: any length, first order in time.
 
     Args:
-      evaluation: how a policy is evaluated; ``None`` is ``Krylov()`` with noise and ``Sweeps()`` without.
-      tol: bound on what the policy iterations leave over the whole march, in cost units; ``None`` is 1e-6, or as much
-        of max V − min V where that is less than one.
-      max_steps: policy improvements in one step, at most.
+      evaluation: the method of policy evaluation; ``None`` is ``Krylov()`` with noise and ``Sweeps()`` without.
+      tol: bound on the sum of the policy iterations' errors over the march, in cost units; ``None`` is 1e-6, times the
+        range max V − min V if this is less than one.
+      max_steps: the largest number of policy improvements in one step.
     """
 
     evaluation: Evaluation | None = None
@@ -295,18 +295,18 @@ class Implicit(TimeMethod):
         arguments.count(self.max_steps, "Implicit: max_steps")
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Implicit":
-        """The method with an evaluation, if none was asked for; its numbers in the type of the march."""
+        """The method with this evaluation, if its own is open; its numbers in the dtype of the march."""
         tol = None if self.tol is None else _as(self.tol, on.dtype)
         return Implicit(self.evaluation or evaluation, tol, self.max_steps)
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
-        """V at ``end`` from V at t, true if the policy iteration came to its end, and a look at its last policy."""
-        # the chain, the costs and the constraints of the time at which W is asked for, and V/Δt from the time before
+        """V at ``end`` from V at t, true if the policy iteration converged, and rates and noise of its last policy."""
+        # the chain, the costs and the constraints at the time of W, and V/Δt from the previous time
         question = ImplicitStep.of(march.on.at(end), march.obstacles_at(end), value, dt)
         assert self.evaluation is not None
-        # what a step leaves adds up over the march, so that each has its share of the tolerance
+        # the errors of the steps add up over the march, so each step gets a fraction of the tolerance
         tol = Tolerance((TOL if self.tol is None else self.tol) * dt / march.horizon, of_spread=self.tol is None)
-        # the derivative is that of the solution and not of the steps to it
+        # the derivative of the solution, not of the iteration
         known, start, tol = jax.lax.stop_gradient((question, value, tol))
         value, policy, ok = known.solve(start, self.evaluation, tol, self.max_steps)
         found = value, policy, known.equation(value, policy)
@@ -314,31 +314,31 @@ class Implicit(TimeMethod):
         return value, ok, march.look(value, list(policy.controls), list(policy.disturbances), end)
 
     def described(self) -> str:
-        """The method as one would write it."""
+        """The method as source text."""
         tol = "" if self.tol is None else f", tol={float(self.tol):g}"
         return f"Implicit({self.evaluation!r}{tol})"
 
 
 def _elapsed(problem: Problem, share: Scalar, length: Scalar, dt: Number) -> tuple[Scalar, Scalar | float]:
-    """The time since a step began at a share of its length S in s, and the factor 1/(1 − β s) there."""
+    """The time since a step began at a fraction of its length S in s, and the factor 1/(1 − β s) there."""
     if problem.discounted is False:
         return share * dt, 1.0
     discount = jnp.asarray(problem.discount, length.dtype)
     some = discount > 0
     left = 1 - discount * share * length
     time = -jnp.log(left) / jnp.where(some, discount, 1)
-    # at the end Δt itself, which a logarithm gives back up to rounding
+    # at the end exactly Δt, which the logarithm returns only up to rounding
     return jnp.where(some & (share < 1), time, share * dt), 1 / left
 
 
 def _as(number: Number, dtype: DType) -> Number:
-    """A number in the type of a march; one that is traced keeps its own."""
+    """A number in the dtype of a march; a traced number keeps its dtype."""
     return number if is_traced(number) else jnp.asarray(number, dtype)
 
 
 @pytree_dataclass(static=("of_spread",))
 class Tolerance:
-    """How much of W a step may leave: ``size`` cost units, or as much of max W − min W where that is less than one."""
+    """The allowed error of W in a step: ``size`` cost units, times max W − min W if this is less than one."""
 
     size: Number
     of_spread: bool
@@ -366,9 +366,9 @@ class ImplicitStep:
 
     @classmethod
     def of(cls, on: Discretisation, obstacles: Obstacles, value: Field, dt: Number) -> "ImplicitStep":
-        """The problem whose solution is V a time Δt before that of ``value``, on the chain of that earlier time."""
+        """The problem whose solution is V a time Δt before ``value``, for the chain at that earlier time."""
         rate = 1 / stretched(dt, on.problem, value.dtype)
-        # not by Problem(...), which refuses a discount beside a running maximum
+        # not by Problem(...), which refuses a discount together with a running maximum
         shifted = altered(on.problem, discount=on.problem.discount + rate)
         return cls(on.asking(shifted), obstacles, value * rate)
 
@@ -382,11 +382,11 @@ class ImplicitStep:
         return bellman.policy_equation(self.on, value, policy, self.obstacles)
 
     def reply(self, value: Field, policy: Greedy) -> Greedy:
-        """The inner player's answer to the outer player's policy."""
+        """The inner player's response to the outer player's policy."""
         return self._complete(bellman.respond(self.on, value, self.obstacles.fixed, policy))
 
     def impose(self, value: Field) -> Field:
-        """``value`` with the fixed values put in and the constraints respected."""
+        """``value`` with fixed values inserted and constraints imposed."""
         return self.obstacles.impose(value)
 
     def residual(self, equation: PolicyEquation) -> Scalar:
@@ -396,31 +396,32 @@ class ImplicitStep:
     def solve(
         self, value: Field, evaluation: Evaluation, tol: Tolerance, max_steps: int
     ) -> tuple[Field, Greedy, jax.Array]:
-        """W, its policy, and true if W is known to ``tol`` or to rounding.
+        """W, its policy, and true if the error of W is below ``tol`` or rounding.
 
         Args:
-          value: where to start.
-          evaluation: how a policy is evaluated.
+          value: the initial guess.
+          evaluation: the method of policy evaluation.
           tol: bound on the algebraic error of the step.
-          max_steps: policy improvements, at most.
+          max_steps: the largest number of policy improvements.
         """
 
         def look(value, incumbent):
-            # a search between samples may miss the action of the step before, and would go to and fro between two
+            # the incumbent stays a candidate, since a search between samples may miss it and alternate between two
+            # actions
             policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed, incumbent=incumbent))
             equation = self.equation(value, policy)
             iterate = Iterate(self.grid, value, policy, equation, self.obstacles, counted=True)
             bound = certificates.error_bound(Certificate.ADDITIVE, iterate, discount=self.on.problem.discount)
-            # a short step's share of the tolerance may be less than the rounding of V, and would never be reached
+            # the tolerance of a short step may be less than the rounding error of V, and could not be reached
             rounding = ROUNDING * jnp.finfo(value.dtype).eps * self.grid.largest(jnp.abs(value))
-            # below that a relative accuracy is lost to underflow, as over a horizon of 1e-300
+            # below this, relative accuracy is lost to underflow, as for a horizon of 1e-300
             rounding = jnp.maximum(rounding, jnp.finfo(value.dtype).tiny / jnp.finfo(value.dtype).eps)
             enough = (bound.error <= tol.at(value, self.grid)) | (bound.residual <= rounding)
             return policy, bound.residual, enough
 
         def unfinished(carry):
             _, _, residual, done, _, count = carry
-            # a NaN is the march's to report
+            # the march reports NaN
             return ~done & (count <= max_steps) & ((count == 0) | jnp.isfinite(residual))
 
         def improve(carry):
@@ -436,21 +437,21 @@ class ImplicitStep:
             value = jax.lax.cond(goes_on, evaluated, lambda: value)
             return value, policy, residual, done, jnp.minimum(least, before), count + 1
 
-        start = self.impose(value)  # V at t is a guess for W that is wrong by O(Δt) only
+        start = self.impose(value)  # V at t is a guess for W with an error of O(Δt)
         endless, zero = jnp.asarray(jnp.inf, start.dtype), jnp.zeros_like(start)
         sizes = (0 if each is None else each.dim for each in (self.on.problem.controls, self.on.problem.disturbances))
-        nobody = Greedy(zero, *((zero,) * size for size in sizes))  # moved into the sets before it is tried
-        carry = (start, nobody, endless, jnp.zeros((), bool), endless, jnp.zeros((), jnp.int32))
+        undecided = Greedy(zero, *((zero,) * size for size in sizes))  # projected into the sets before use
+        carry = (start, undecided, endless, jnp.zeros((), bool), endless, jnp.zeros((), jnp.int32))
         value, policy, _, done, _, _ = jax.lax.while_loop(unfinished, improve, carry)
         return value, policy, done
 
     def _complete(self, policy: Greedy) -> Greedy:
-        """A policy of the problem with its defect, V/Δt included."""
-        # V/Δt is no part of the problem's cost: it is the same for all actions, and chooses none
+        """A policy of the problem with its defect, including V/Δt."""
+        # V/Δt is not part of the problem's cost; it is the same for all actions, so it does not affect the choice
         return dataclasses.replace(policy, defect=jnp.where(self.obstacles.fixed, 0, policy.defect + self.arriving))
 
     def _evaluated(self, value: Field, policy: Greedy, goal: Number, evaluation: Evaluation) -> Field:
-        """The value of the policy, roughly; in a game of the outer player's."""
+        """The value of the policy, approximately; in a game of the outer player's policy."""
         if self.on.problem.is_game:
             return methods.evaluated(self, value, policy, evaluation, goal=goal, replies=REPLIES)
         return self.impose(value + evaluate(evaluation, self.equation(value, policy), self.grid))

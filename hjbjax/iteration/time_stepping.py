@@ -1,8 +1,8 @@
-"""Many steps in time: V_t + min max H − β V = 0 from the horizon back to 0, with targets and constraints.
+"""The loop over time steps: V_t + min max H − β V = 0 from the horizon back to 0, with targets and constraints.
 
-A method of ``time_methods`` makes one step. Where the fastest action is not at an end of its set, or the rate Q of
-leaving a node changes within a step, Q is looked at under the actions that every stage chose, and a step that was too
-long for it is done again in shorter ones. Steps end on the kept times exactly: those that are left are of equal length.
+A method of ``time_methods`` makes one step. If the fastest action is not at an end of its set, or the rate Q of leaving
+a node changes within a step, Q is evaluated under the actions chosen in every stage, and a step that was too long is
+repeated with shorter steps. Steps end exactly on the kept times; the remaining steps of an interval have equal length.
 """
 
 import dataclasses
@@ -28,8 +28,8 @@ from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Field, Mask, Nodes, Number, Numbers, Scalar
 from hjbjax.solution.status import Status
 
-TRIES = 30  # of a step that is shortened, at most; what its first stage sees does not depend on its length
-NEAR = 1e-3  # of a bound's distance: a disturbance so near its bound sits on it
+TRIES = 30  # largest number of attempts to shorten a step; the rates of its first stage do not depend on its length
+NEAR = 1e-3  # relative to the bound: a disturbance this close to its bound counts as saturated
 
 
 @pytree_dataclass(static=("checks_rates", "checks_noise", "checks_gap", "checks_cut", "bare"))
@@ -39,19 +39,19 @@ class March:
     Args:
       on: the problem on its grid, with the slopes of a scheme.
       method: ``Explicit`` with its stages, or ``Implicit`` with its evaluation.
-      obstacles: fixed nodes and constraints; ``None`` where they depend on the time, or nothing but V is kept.
-      limit: the longest stable step, inf if all are; ``None`` where it depends on the time.
-      step: the longest step wanted; inf where the limit alone counts. Of functions of the time one entry for each of
-        as many equal parts of the horizon, from t = 0 on, shape (parts, 1).
+      obstacles: fixed nodes and constraints; ``None`` if they depend on time, or if only V is stored.
+      limit: the longest stable step, inf if all are stable; ``None`` if it depends on time.
+      step: the longest requested step; inf if only the limit applies. For functions of time one entry for each of
+        several equal parts of the horizon, from t = 0 on, shape (parts, 1).
       horizon: the time at which the terminal cost is paid.
       watched: bool (*grid), nodes where a disturbance at its bound means that the value blows up; or ``None``.
-      checks_rates: true if explicit steps look at Q under the actions that they chose.
-      checks_noise: true if steps look for correlated noise that the chain cannot represent.
-      checks_gap: true if the gap between min max and max min is looked at before every step.
-      checks_cut: true if steps count the nodes at which drift out of the box is cut off.
-      bare: true if nothing but V is kept: what can be made of it is made where it is used.
-      missed: the relative error of integrals over functions of the time with these steps, where they were made shorter
-        for them; else zero.
+      checks_rates: True if explicit steps evaluate Q under the chosen actions.
+      checks_noise: True if steps check for correlated noise that the chain cannot represent.
+      checks_gap: True if the gap between min max and max min is evaluated before every step.
+      checks_cut: True if steps count the nodes at which drift out of the box is cut off.
+      bare: True if only V is stored; everything else is computed where it is used.
+      missed: the relative error of integrals over functions of time with these steps, if they were shortened for these
+        functions; else zero.
     """
 
     on: Discretisation
@@ -59,7 +59,7 @@ class March:
     obstacles: Obstacles | None
     limit: Number | None
     step: Number
-    horizon: Any  # an array in the type of the values where the host drives the march, a float inside transformations
+    horizon: Any  # an array in the dtype of the values if the host drives the march, a float inside transformations
     watched: Mask | None
     checks_rates: bool = False
     checks_noise: bool = False
@@ -70,16 +70,16 @@ class March:
 
     @property
     def problem(self) -> Problem:
-        """The question."""
+        """The problem."""
         return self.on.problem
 
     @property
     def grid(self) -> Grid:
-        """The nodes."""
+        """The grid."""
         return self.on.grid
 
     def obstacles_at(self, t: Number) -> Obstacles:
-        """Held nodes and constraints at the time t."""
+        """Fixed nodes and constraints at the time t."""
         return bellman.obstacles(self.on.at(t)) if self.obstacles is None else self.obstacles
 
     def longest(self, t: Number) -> Scalar:
@@ -90,42 +90,42 @@ class March:
         return jnp.minimum(self.step_at(t), limit)
 
     def step_at(self, t: Number) -> Scalar:
-        """The longest step wanted from the time t on, backwards."""
+        """The longest requested step from the time t on, backwards."""
         steps = jnp.asarray(self.step)
         if steps.ndim == 0:
             return steps
         count = len(steps)
-        # a time between two parts belongs to the earlier one, which comes next
+        # a time between two parts belongs to the earlier part, which comes next
         part = jnp.ceil(t / self.horizon * count - 1e-3).astype(jnp.int32) - 1
         return steps[jnp.clip(part, 0, count - 1), 0]
 
     def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
-        """F = min max H − β V, cost per unit time, and the rates and the noise under the optimal actions."""
+        """F = min max H − β V, cost per unit time, with the rates and the noise under the optimal actions."""
         best, u, d = optimum.optimise(dataclasses.replace(discrete.around(self.on.at(t), value), bare=self.bare))
         return best - self.problem.discount * value, self.look(value, u, d, t)
 
     def look(self, value: Field, u: Action, d: Action, t: Number) -> "Seen":
-        """The largest Q + β under these actions, the first node whose noise has no chain, and what is cut off."""
+        """The largest Q + β under these actions, the first node whose noise has no chain, and the cut-off drift."""
         on, dtype = self.on.at(t), self.on.dtype
         seen = self.nothing_seen()
         if self.checks_cut:
             found = edges.count_leaving(on, value, u, d, self.obstacles_at(t).acting(value))
             seen = dataclasses.replace(seen, cut=found)
-        if self.checks_rates:  # a pass over all rates, which is spared where the limit of the step is known
+        if self.checks_rates:  # a pass over all rates, skipped if the limit of the step is known
             fastest = on.grid.largest(jump_rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
             seen = dataclasses.replace(seen, fastest=fastest)
         if self.checks_noise:
             lacking = correlated_noise.lacking(on, on.diffusion(u, d))
             if lacking is None:
                 return seen
-            # at a fixed node nothing moves, whatever the noise is there
+            # at a fixed node nothing moves, so its noise does not matter
             lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~self.obstacles_at(t).fixed
             first = on.grid.first(lacking)
             seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
         return seen
 
     def nothing_seen(self) -> "Seen":
-        """No rate, and no node without a chain."""
+        """The outcome before any evaluation: rate zero, and no node without a chain."""
         dtype = self.on.dtype
         zero = jnp.zeros((), dtype)
         return Seen(zero, jnp.full((), -1, jnp.int32), zero, jnp.zeros((self.grid.ndim, 2), jnp.int32))
@@ -137,13 +137,13 @@ class Front:
 
     Args:
       value: V at the time t.
-      t: the time, for functions of it; rounded, so that no step is made of it.
-      left: the time from t back to the end of the interval in two numbers, of which the second is the rounding of the
-        first: 896,657 steps of a clock in float32 at t = 1e5 were to be 223.
-      steps: how many were taken.
+      t: the time, for functions of it; rounded, so steps are not computed from it.
+      left: the time from t back to the end of the interval as two numbers, the second of which is the rounding error of
+        the first: with a single float32 clock at t = 1e5, 223 steps became 896,657.
+      steps: the number of steps taken.
       code: a Status number.
-      seen: the rates and the noise that the last step saw.
-      gap: the largest gap between min max and max min so far, and how much the actions mattered there, (2,).
+      seen: the rates and the noise of the last step.
+      gap: the largest gap between min max and max min so far, and the influence of the actions there, (2,).
       cut: the largest numbers of nodes at each end where drift was cut off, since the last kept time, (n, 2).
     """
 
@@ -159,13 +159,13 @@ class Front:
 
 @pytree_dataclass()
 class Seen:
-    """Rates and noise under the actions of a step; zero and −1 where they are not looked for.
+    """Rates and noise under the actions of a step; zero and −1 where they are not evaluated.
 
     Args:
-      fastest: the largest Q + β under the actions that were chosen, per unit time.
-      lacking: the first node, counted flat, where noise is correlated more than the spacings allow, or −1.
+      fastest: the largest Q + β under the chosen actions, per unit time.
+      lacking: the flat index of the first node where noise is correlated more than the spacings allow, or −1.
       t: the time of that.
-      cut: the nodes at each end of the box where drift is cut off, (n, 2).
+      cut: the number of nodes at each end of the box where drift is cut off, (n, 2).
     """
 
     fastest: Scalar
@@ -174,7 +174,7 @@ class Seen:
     cut: jax.Array
 
     def joined(self, other: "Seen") -> "Seen":
-        """The larger rate of two looks, and the fault of the noise that was found first."""
+        """The larger rate of two outcomes, and the fault of the noise that was found first."""
         first = self.lacking >= 0
         return Seen(
             jnp.maximum(self.fastest, other.fastest),
@@ -190,12 +190,13 @@ def stable(on: Discretisation, tableau: Tableau = TABLEAUX[1], share: Numbers = 
 
 
 def terminal(on: Discretisation, start: Nodes | None = None) -> Field:
-    """V at the horizon, the time of ``on``: ``start`` or the terminal cost, with given values and constraints put in.
+    """V at the horizon, the time of ``on``: ``start`` or the terminal cost, with fixed values and constraints imposed.
 
-    Without either a stopping cost is paid at the latest then, and a running maximum is g itself; else nothing is paid.
+    Without either, a stopping cost is paid at the latest then, and a running maximum is g itself; else the value is
+    zero.
     """
     obstacles, problem = bellman.obstacles(on), on.problem
-    if start is not None:  # the user's, which need not respect the constraints
+    if start is not None:  # the user's start need not satisfy the constraints
         return obstacles.impose(jnp.asarray(start, on.dtype))
     cost = problem.terminal_cost
     if cost is None:
@@ -204,7 +205,7 @@ def terminal(on: Discretisation, start: Nodes | None = None) -> Field:
 
 
 def begin(march: March, value: Field, left: Number) -> Front:
-    """The front at the horizon, with the time that is left to the end of the first interval."""
+    """The front at the horizon, with the time to the end of the first interval."""
     zero = jnp.zeros((), jnp.int32)
     t, none = jnp.asarray(march.horizon, value.dtype), jnp.zeros((2,), value.dtype)
     clock = jnp.asarray([left, 0], value.dtype)
@@ -213,7 +214,7 @@ def begin(march: March, value: Field, left: Number) -> Front:
 
 
 def run(march: March, front: Front, until: Number, most: Number) -> Front:
-    """At most ``most`` steps towards the time ``until``, as long as the values are finite."""
+    """Take at most ``most`` steps towards the time ``until``, as long as the values are finite."""
 
     def goes_on(carry):
         front, left = carry
@@ -221,7 +222,7 @@ def run(march: March, front: Front, until: Number, most: Number) -> Front:
 
     def step(carry):
         front, left = carry
-        if march.bare:  # loop variant, or XLA makes arrays of what the grid alone decides, and keeps them
+        if march.bare:  # made loop-variant, otherwise XLA stores arrays that depend only on the grid
             grid, front = jax.lax.optimization_barrier((march.grid, front))
             return advance(dataclasses.replace(march, on=march.on.on_grid(grid)), front, until), left - 1
         return advance(march, front, until), left - 1
@@ -230,11 +231,11 @@ def run(march: March, front: Front, until: Number, most: Number) -> Front:
 
 
 def _moved(front: Front, until: Scalar, count: Scalar) -> tuple[Scalar, Scalar, jax.Array]:
-    """The length of the first of ``count`` equal steps to ``until``, the time at its end, and what is left there."""
+    """The length of the first of ``count`` equal steps to ``until``, the time at its end, and the remaining time."""
     left, rest = front.left
     dt = left / count
     less = left - dt
-    rest = rest + ((left - less) - dt)  # what the difference rounds off, exactly
+    rest = rest + ((left - less) - dt)  # the rounding error of the difference, exactly
     total = less + rest
     # the last step, count = 1, ends on ``until`` to the bit
     after = jnp.where(count > 1, jnp.stack([total, rest - (total - less)]), 0)
@@ -242,12 +243,12 @@ def _moved(front: Front, until: Scalar, count: Scalar) -> tuple[Scalar, Scalar, 
 
 
 def advance(march: March, front: Front, until: Number) -> Front:
-    """One step towards ``until``: the first of equal ones in the time that is left."""
+    """One step towards ``until``: the first of equal steps in the remaining time."""
     until = jnp.asarray(until, front.value.dtype)
     longest = march.longest(front.t)
-    if march.checks_rates:  # a step like the last one rather than one that is done again
+    if march.checks_rates:  # a step like the last one is better than one that must be repeated
         longest = jnp.minimum(longest, _allowed(march, front.seen, march.method.courant))
-    # 1e-4 of a step: a remainder that is rounding of the time makes no step of its own
+    # 1e-4 of a step: a remainder that is rounding of the time does not get its own step
     count = jnp.maximum(jnp.ceil(front.left[0] / longest - 1e-4), 1)
     gap = _larger_gap(march, front) if march.checks_gap else front.gap
     if march.checks_rates:
@@ -255,14 +256,14 @@ def advance(march: March, front: Front, until: Number) -> Front:
     else:
         dt, t, left = _moved(front, until, count)
         value, ok, seen = march.method.step(march, front.value, front.t, t, dt)
-    # finite only if all values are: ∞ − ∞ is a NaN
+    # finite only if all values are: ∞ − ∞ is NaN
     low, high = march.grid.least(value), march.grid.largest(value)
-    # each fault overrules those before it
+    # later faults override earlier ones
     code = jnp.where(ok, Status.RUNNING, Status.STALLED)
     if march.watched is not None:
         code = jnp.where(_saturates(march, value, t), Status.DIVERGED, code)
     code = jnp.where(jnp.isfinite(high - low), code, Status.NONFINITE)
-    if march.checks_noise:  # such a step is not taken
+    if march.checks_noise:  # such a step is not accepted
         taken = seen.lacking < 0
         value, t, left = (
             jnp.where(taken, new, old) for new, old in ((value, front.value), (t, front.t), (left, front.left))
@@ -273,38 +274,38 @@ def advance(march: March, front: Front, until: Number) -> Front:
 
 
 def _larger_gap(march: March, front: Front) -> jax.Array:
-    """The gap between min max and max min before a step, where it is larger than those before it; (2,)."""
+    """The gap between min max and max min before a step, if it is larger than the previous ones; (2,)."""
     hamiltonian = discrete.around(march.on.at(front.t), front.value)
     free = ~march.obstacles_at(front.t).fixed
     upper, lower = isaacs.extremes(hamiltonian)
     gap = isaacs.gap_between(hamiltonian, free, upper, lower)
 
-    def weigh() -> jax.Array:  # 81 pairs of actions, which are spared where the gap is no larger
+    def weigh() -> jax.Array:  # 81 pairs of actions, evaluated only if the gap is larger
         return jnp.stack([gap, isaacs.weight_of_actions(hamiltonian, free, upper, lower)])
 
     return jax.lax.cond(gap > front.gap[0], weigh, lambda: front.gap)
 
 
 def _allowed(march: March, seen: Seen, share: Number) -> Scalar:
-    """The longest step at the rates that were seen."""
+    """The longest step at the evaluated rates."""
     return longest_step(seen.fastest, march.problem, share, march.method.tableau)
 
 
 def _short_enough(
     march: March, front: Front, until: Scalar, count: Scalar
 ) -> tuple[Field, tuple[Scalar, jax.Array], jax.Array, Seen]:
-    """V after one of ``count`` or more equal steps, its clock, true if the step was stable in every stage, and Q."""
+    """V after one of ``count`` or more equal steps, its clock, true if every stage was stable, and the rates."""
     left = front.left[0]
 
     def too_long(carry):
         count, tries, _, seen = carry
-        # with Q = ∞ before the first attempt this is true; 1e-6 is rounding of the product, no instability
+        # initially Q = ∞, so this is true; 1e-6 is rounding of the product, not instability
         most = _allowed(march, seen, 1 / march.method.tableau.euler)
         return (left / count > most * (1 + 1e-6)) & (tries < TRIES)
 
     def attempt(carry):
         count, tries, _, seen = carry
-        # from the rates just seen, and one step more at least, so that every attempt is shorter
+        # from the rates just evaluated, with at least one more step, so that every attempt is shorter
         more = jnp.maximum(jnp.ceil(left / _allowed(march, seen, march.method.courant) - 1e-4), count + 1)
         count = jnp.where(tries > 0, more, count)
         dt, t, _ = _moved(front, until, count)
@@ -315,18 +316,18 @@ def _short_enough(
     endless = dataclasses.replace(nothing, fastest=jnp.full_like(nothing.fastest, jnp.inf))
     start = (count, jnp.zeros((), jnp.int32), front.value, endless)
     carry = jax.lax.while_loop(too_long, attempt, start)
-    # with no tries counted: true if the last attempt was short enough, false where the loop only ran out of them
+    # with tries reset: true if the last attempt was short enough, false if the attempts ran out
     return carry[2], _moved(front, until, carry[0])[1:], ~too_long((carry[0], 0, *carry[2:])), carry[3]
 
 
 def repeat(march: March, value: Field, start: float, end: float, count: int) -> tuple[Field, jax.Array]:
-    """V after ``count`` equal steps from the time ``start`` to ``end``, known numbers; differentiable both ways.
+    """V after ``count`` equal steps from ``start`` to ``end``, which are known numbers; differentiable in both modes.
 
-    Reverse mode keeps V before each of √count chunks, and goes through the steps of one chunk at a time a second time,
-    and a third: of K steps it holds some 2 √K values, and what one step makes.
+    Reverse mode stores V before each of √count chunks, and recomputes the steps of one chunk at a time, twice. For K
+    steps it stores about 2 √K values, plus the memory of one step.
 
     Returns:
-      V, and true if every step did what it does at host level without a fault.
+      V, and true if every step passed the checks of host level.
     """
     fine = jnp.ones((), bool)
     if count == 0:
@@ -337,20 +338,20 @@ def repeat(march: March, value: Field, start: float, end: float, count: int) -> 
 
     def move(carry: tuple[Field, jax.Array], k: jax.Array) -> tuple[Field, jax.Array]:
         value, fine = carry
-        t = start - k.astype(value.dtype) * dt  # from the start, so that roundings of Δt do not add up
+        t = start - k.astype(value.dtype) * dt  # from the start, so that rounding errors of Δt do not add up
         value, ok, seen = march.method.step(march, value, t, t - dt, jnp.asarray(dt, value.dtype))
         return value, fine & ok & _faultless(march, value, t - dt, dt, seen)
 
-    @functools.partial(jax.checkpoint, prevent_cse=False)  # a scan keeps its turns apart by itself
+    @functools.partial(jax.checkpoint, prevent_cse=False)  # a scan keeps its iterations apart anyway
     def step(carry: tuple[Field, jax.Array], k: jax.Array) -> tuple[tuple[Field, jax.Array], None]:
-        # the last chunk is filled up with steps that are not taken
+        # the last chunk is padded with steps that are not taken
         return jax.lax.cond(k < count, move, lambda carry, k: carry, carry, k), None
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def chunk(carry: tuple[Field, jax.Array], numbers: jax.Array) -> tuple[tuple[Field, jax.Array], None]:
         return jax.lax.scan(step, carry, numbers)
 
-    # a scan and no while loop, which has no reverse mode
+    # a scan, because a while loop has no reverse mode
     return jax.lax.scan(chunk, (value, fine), numbers)[0]
 
 
@@ -368,7 +369,7 @@ def _faultless(march: March, value: Field, t: Number, dt: Number, seen: Seen) ->
 
 
 def greedy(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
-    """The control and the disturbance at the time t, each component of shape (*grid), of the H that steps solve."""
+    """The control and the disturbance at the time t, components of shape (*grid), for the Hamiltonian of the steps."""
     on = march.on.at(t)
     _, u, d = optimum.optimise(discrete.around(on, value))
 
@@ -379,7 +380,7 @@ def greedy(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tu
 
 
 def _saturates(march: March, value: Field, t: Number) -> jax.Array:
-    """True if the worst disturbance sits on its bound at a watched node."""
+    """True if the worst disturbance is at its bound at a watched node."""
     admissible = march.problem.disturbances
     assert isinstance(admissible, Box)
     assert march.watched is not None

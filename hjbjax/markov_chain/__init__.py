@@ -1,8 +1,8 @@
-"""The Markov chain as a process: where it goes, whether what it costs is finite, and its exports.
+"""The Markov chain as a process: reachability, finiteness of costs, and exports.
 
-Before a solve ``node_checks`` looks at what the functions return, ``admissibility`` at constrained ends,
-``attainability`` at which nodes can be brought to the target (``tried_actions``: by which actions), ``resting`` at
-where the system can rest at no cost, and ``memory`` at whether there is room; after it ``earnings`` looks at costs
-earned for ever. ``chain`` has the generator and what other solvers take, ``stationary_law`` where the chain stays in
-the end, and ``decision_process`` the decision problem.
+Before a solve, ``node_checks`` checks the values of the problem's functions and ``admissibility`` the constrained ends.
+``attainability`` finds the nodes from which the target can be reached (``tried_actions``: the actions to try),
+``resting`` the nodes where the system can rest at no cost, and ``memory`` checks that there is room. After a solve,
+``earnings`` looks for costs that are earned indefinitely. ``chain`` exports the generator for other solvers,
+``stationary_law`` computes stationary distributions, and ``decision_process`` builds the decision problem.
 """

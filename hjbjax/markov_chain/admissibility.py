@@ -1,6 +1,6 @@
-"""Whether every node of a grid with constrained ends has an action that keeps the state in the box; host level.
+"""Check that every node of a grid with constrained ends has an action that keeps the state in the box; host level.
 
-Without costs and at V = 0 the Hamiltonian is zero where there is one, and infinite elsewhere.
+With zero costs and V = 0 the Hamiltonian is zero where such an action exists, and infinite elsewhere.
 """
 
 import jax
@@ -20,48 +20,48 @@ from hjbjax.problem.types import DType, Mask
 
 
 def values(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
-    """Refuse a problem that at some node forces the state out across a constrained end.
+    """Refuse a problem whose drift forces the state out across a constrained end at some node.
 
     Args:
-      problem: the problem; one that passed ``checks.shapes``.
+      problem: the problem; must have passed ``checks.shapes``.
       grid: the grid.
-      dtype: the floating-point type in which the drift is evaluated.
+      dtype: the floating-point type for the drift.
       t: the time, if the problem depends on it.
 
     Raises:
-      ValueError: with the number of nodes, the first of them and its state, and what to do.
+      ValueError: some node has no admissible action; names the first such node and a remedy.
     """
     if not grid.sides("constrained"):
         return
     with own_settings(x64=True):
-        # the chain's scheme whatever the user's: which actions an end rules out depends on the drift alone
+        # always the chain's own scheme, since the actions that an end forbids depend only on the drift
         stuck = np.asarray(_without_action(Discretisation(problem, grid, Upwind(), np.dtype(dtype), t)))
     if not stuck.any():
         return
-    index = tuple(int(i) for i in np.argwhere(stuck)[0])  # the first one stands for all, which may be thousands
+    index = tuple(int(i) for i in np.argwhere(stuck)[0])  # report the first only, there may be thousands
     ends = [
         f"the {'upper' if step > 0 else 'lower'} end of {grid.names[axis]}"
         for axis, step in grid.sides("constrained")
         if index[axis] == (grid.shape[axis] - 1 if step > 0 else 0)
     ]
-    # without a cost, as in the search itself: one that is no polynomial would make it a matter of samples
+    # without the cost, as in the search above; a cost that is not a polynomial would make the search use samples
     exact = find_players(altered(problem, cost=None), grid.ndim, np.float64).exact
     found = "no action is admissible" if exact else "none of the sampled actions is admissible"
     raise ValueError(
         f"Grid.edges: {found} at {int(stuck.sum())} of {grid.size} nodes, first at node {index}, "
         f"x = {np.array2string(grid.state(index), separator=', ', precision=6)}"
         + (f", t = {t:g}" if problem.time_dependent else "")
-        + f":\nevery drift leaves the box across {' or '.join(ends)}, which is constrained. Give controls that can "
+        + f":\nevery drift leaves the box across {' or '.join(ends)}, which is constrained. Use controls that can "
         "keep the state in,\nmove that end to where they can, or make it 'projected' or 'open'"
     )
 
 
 @jax.jit
 def _without_action(on: Discretisation) -> Mask:
-    """The nodes off the target without an admissible action, bool (*grid)."""
-    # V = 0 and L = 0 leave the infinite price of leaving as the only term of H
+    """The nodes outside the target without an admissible action, bool (*grid)."""
+    # with V = 0 and L = 0 the infinite price of leaving is the only term of H
     free = altered(on.problem, cost=None)
     hamiltonian = discrete.around(on.asking(free), jnp.zeros(on.grid.shape, on.dtype))
     least = optimum.optimise(hamiltonian)[0]
-    # on the target the run is over and needs no action
+    # on the target the run has ended, so no action is needed
     return ~jnp.isfinite(least) & ~bellman.obstacles(on).fixed

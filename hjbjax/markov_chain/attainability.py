@@ -1,10 +1,10 @@
-"""Which nodes can be brought to the target for certain, read off the graph of the chain.
+"""The nodes from which the target can be reached with certainty, from the graph of the chain.
 
-Without discount the value is finite exactly where some policy reaches the held nodes with probability one (a
-proper policy). The largest such set R is a fixed point: take away the nodes from which no path of jumps leads
-to the target by actions that keep every jump inside R, until nothing changes. The jumps of sampled actions are found
-on the device. The paths are followed on the host by sweeps: one running "or" along an axis follows all jumps of one
-direction to their end, so that two or three rounds of sweeps usually find every path, however long it is.
+Without discount the value is finite exactly where some policy (a proper policy) reaches the fixed nodes with
+probability one. The largest such set R is a fixed point: remove the nodes without a path of jumps to the target by
+actions that keep every jump inside R, until nothing changes. The jumps of sampled actions are computed on the device.
+The paths are followed on the host by sweeps: one cumulative "or" along an axis follows all jumps in one direction to
+their end, so two or three rounds of sweeps usually find every path, however long.
 """
 
 import functools
@@ -25,10 +25,10 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Array, Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 
-FEW = 9  # of each player in a game, where all pairs are
-WINDING = 30  # rounds of sweeps after which a search takes over: each follows paths round one more corner
-SEARCHABLE = 5 * 10**7  # jumps that a search can list: some 60 bytes each
-LOOK = 10**7  # nodes times actions between two looks at the clock: about a second
+FEW = 9  # actions per player in a game, where all pairs are tried
+WINDING = 30  # rounds of sweeps before a graph search takes over; each round follows paths around one more corner
+SEARCHABLE = 5 * 10**7  # largest number of jumps for a graph search, at some 60 bytes each
+LOOK = 10**7  # nodes times actions between two checks of the clock: about a second
 
 
 def _open_jumps(
@@ -36,28 +36,28 @@ def _open_jumps(
 ) -> Rates:
     """For every jump the nodes, bool (*grid), with an action that makes it and whose jumps all stay ``inside``.
 
-    The first ``count`` actions of ``points`` are tried. Without ``inside`` it is the box. Rates up to ``least`` are
-    rounding; with ``kinks`` actions between the samples, at which a component of the drift vanishes, are tried as well.
+    Tries the first ``count`` actions of ``points``. ``inside=None`` means the box. Rates up to ``least`` count as
+    rounding. With ``kinks``, the actions between samples at which a component of the drift vanishes are tried too.
     """
     known = _no_jumps(on, points)
     some = max(1, LOOK // on.grid.size)
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
         lot = first, min(first + some, count)
-        # the actions beside the samples do not depend on these: once, with the first lot
+        # these additional actions do not depend on the samples, so they are tried once, with the first batch
         known = _more_open_jumps(on, inside, known, points, lot, least=least, kinks=kinks, others=kinks and first == 0)
     return known
 
 
-@jax.jit  # never run: its trace is kept
+@jax.jit  # never executed, only traced
 def _jumps_of(on: Discretisation, action: Array) -> Rates:
     """The jumps under one action at every node, shape (m,)."""
     return jump_rates(on, list(action))
 
 
 def _no_jumps(on: Discretisation, points: Array) -> Rates:
-    """The jumps that the chain may make, none of them open."""
-    # the offsets are those of every action, since they follow from the noise and not from what is done
+    """The possible jumps of the chain, none of them open."""
+    # the offsets depend on the noise, not on the action
     offsets = _jumps_of.eval_shape(on, jax.ShapeDtypeStruct(np.shape(points)[1:], on.dtype)).offsets
     return Rates(offsets, tuple(np.zeros(on.grid.shape, bool) for _ in offsets))
 
@@ -74,15 +74,15 @@ def _more_open_jumps(
     kinks: bool,
     others: bool,
 ) -> Rates:
-    """The jumps that are known to be open and those of a lot of the actions ``points``, from one row to another."""
-    # a jump is open once any action makes it, so that the order of the actions, and one tried twice, change nothing
+    """The jumps known to be open, and those opened by a range (first, last) of the actions ``points``."""
+    # a jump is open once any action makes it, so order and repetition of actions do not matter
     grid, points = on.grid, jnp.asarray(points, on.dtype)
     mine = players_of(on).control
 
     def tried(actions, opened):
         for each in actions:
             rates = jump_rates(on, each)
-            # an action that a constrained end rules out makes no jump at all, not one to the node itself
+            # an action that a constrained end forbids makes no jump at all, not even to the node itself
             stays = ~edges.inadmissible(on, each)
             if inside is not None:
                 stays &= _stays(rates, grid, inside, least)
@@ -102,18 +102,18 @@ def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Ar
     """The nodes from which all jumps at rates above ``least`` lead ``inside``, bool (*grid)."""
     stays = jnp.ones(grid.shape, bool)
     for offset, c in zip(rates.offsets, rates.values, strict=True):
-        # beyond the ends of the box there is no jump: rates that lead out are zero
+        # no jump leaves the box: rates that lead out are zero
         stays &= (c <= least) | stencil.neighbour(inside, grid, offset)
     return stays
 
 
 class Reach(NamedTuple):
-    """The nodes from which a set of held nodes is reached under some policy, each bool (*grid).
+    """The nodes from which a set of fixed nodes is reached under some policy, each bool (*grid).
 
     Attributes:
       surely: with probability one.
-      maybe: with some probability. Without noise the difference is due to the chain: its jumps spread like noise of
-        the size of a cell, which may carry it past a target that the path meets.
+      maybe: with positive probability. Without noise the difference is due to the chain, whose jumps spread like noise
+        of the size of a cell, which may carry it past a target on the path.
     """
 
     surely: Mask
@@ -123,20 +123,20 @@ class Reach(NamedTuple):
 def reached(
     on: Discretisation, held: np.ndarray, *, surely: bool, least: Number = 0.0, clock: Clock | None = None
 ) -> Reach:
-    """The nodes from which the held nodes can be reached; host level, for problems with one player.
+    """The nodes from which the fixed nodes can be reached; host level, for problems with one player.
 
     Args:
       on: the chain.
       held: bool (*grid), the nodes to reach.
-      surely: find the nodes that reach them with probability one; otherwise both sets are the larger one.
-      least: a rate per unit time; up to it jumps are rounding.
-      clock: the limits; raises ``Stopped`` where they are exceeded.
+      surely: compute the nodes that reach them with probability one; otherwise both sets are the larger one.
+      least: a rate per unit time; jumps at rates up to it count as rounding.
+      clock: the limits; raises ``Stopped`` when they are exceeded.
     """
-    on = on.on_grid(on.grid.walled)  # what goes on beyond an open end is not known to come back
+    on = on.on_grid(on.grid.walled)  # a path that leaves through an open end may not return
     clock, found, maybe = clock or Clock(), np.zeros(on.grid.shape, bool), np.zeros(on.grid.shape, bool)
     points, few = tried_actions.control_samples(on.problem)
-    # few actions are enough for most problems, and what samples do not reach may be reached by the one action that
-    # keeps to a way. Each pass is sound: whatever it finds is reached by actions of the set, so that the union is, too
+    # A few actions suffice for most problems. Nodes that samples do not reach may be reached by an action that keeps
+    # exactly to a path. Every pass uses admissible actions only, so the union of the passes is also reachable.
     for count, kinks in dict.fromkeys([(few, False), (len(points), False), (len(points), True)]):
         jumps = functools.partial(_open_jumps, on, points=points, count=count, clock=clock, least=least, kinks=kinks)
         more = _reached_by(jumps, held, surely, on.grid, clock)
@@ -147,7 +147,7 @@ def reached(
 
 
 def _reached_by(open_jumps: Callable[..., Rates], held: np.ndarray, surely: bool, grid: Grid, clock: Clock) -> Reach:
-    """The nodes from which the held ones are reached by ``open_jumps(inside=...)``."""
+    """The nodes from which the fixed nodes are reached by ``open_jumps(inside=...)``."""
 
     def staying(inside: jax.Array | None) -> np.ndarray:
         return _backward_reach(held, open_jumps(inside=inside), grid, clock)
@@ -156,22 +156,23 @@ def _reached_by(open_jumps: Callable[..., Rates], held: np.ndarray, surely: bool
     inside = np.ones(held.shape, bool)
     while surely and not np.array_equal(found, inside):
         inside = found
-        # nodes are taken away and never put back, as the largest fixed point wants: at most one round a node
+        # nodes are removed and never restored, as for any largest fixed point, so at most one round per node
         found = inside & staying(jnp.asarray(inside))
     return Reach(found, maybe)
 
 
 def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock) -> np.ndarray:
-    """The nodes of a game from which the control reaches the held ones for certain, whatever the disturbance does.
+    """The nodes of a game from which the control reaches the fixed nodes surely, whatever the disturbance does.
 
-    The largest set R in which some control keeps all jumps inside under every disturbance, and leads on to a nearer
-    node; in a lower game, some control for every disturbance. Of a continuum few actions are tried. Arguments are those
-    of ``reached``. Costs a step a cell of the longest way, each of all pairs of actions: for games that fail.
+    This is the largest set R in which some control keeps all jumps inside under every disturbance and leads to a nearer
+    node; in a lower game, for every disturbance there is some control. A continuum is sampled by few actions. Arguments
+    as for ``reached``. Takes one step per cell of the longest path, each over all pairs of actions, so use it for
+    failing games.
     """
     found, on = np.ones(on.grid.shape, bool), on.on_grid(on.grid.walled)
     while True:
-        # the outer loop takes nodes away, the inner one starts from the target each time and climbs: a game of reaching
-        # while staying inside is the largest fixed point of a least one
+        # The outer loop removes nodes; the inner loop starts from the target each time and adds nodes. Reaching a set
+        # while staying inside another is a greatest fixed point of a least fixed point.
         inside, nearer, more = found, jnp.asarray(held), True
         while more:
             clock.enter("the search for nodes from which the target can be forced")
@@ -185,14 +186,14 @@ def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock)
 def _controllable_predecessors(
     on: Discretisation, inside: jax.Array, found: jax.Array, least: Number
 ) -> tuple[jax.Array, Scalar]:
-    """``found`` with the nodes from which the control leads there and stays ``inside``; and if that adds any."""
+    """``found`` plus the nodes from which the control leads there and stays ``inside``, and a flag if any was added."""
     problem, grid, dtype = on.problem, on.grid, on.dtype
     us, ds = (
         jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, FEW), dtype)
         for admissible in (problem.controls, problem.disturbances)
     )
     upper = problem.isaacs == "upper"
-    # who moves first is in the outer loop: in the upper game for some u all d, in the lower for all d some u
+    # the player who moves first is in the outer loop: upper game: some u for all d, lower game: for all d some u
     outer, inner = (us, ds) if upper else (ds, us)
 
     def answered(first):
@@ -204,7 +205,7 @@ def _controllable_predecessors(
                 jnp.logical_or, ((c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps)
             )
             allowed = ~edges.inadmissible(on, list(u), list(d))
-            # for every disturbance one jump is enough that leads on, for all of them none may leave
+            # for every disturbance one jump must lead on, and none may leave
             good = leads & allowed & _stays(rates, grid, inside, least)
             return (ok & good if upper else ok | good), None
 
@@ -218,15 +219,15 @@ def _controllable_predecessors(
 
 
 def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar | None = None) -> jax.Array:
-    """The nodes from which some actions of both players keep the state off the target for ever, bool (*grid).
+    """The nodes from which some actions of both players avoid the target indefinitely, bool (*grid).
 
-    The largest set in which every node has an action whose jumps all stay in it: nodes without one are taken away until
-    nothing changes. Empty means that under every policy the target is reached with probability one. Host level.
+    This is the largest set in which every node has an action whose jumps all stay in the set: nodes without one are
+    removed until nothing changes. If it is empty, every policy reaches the target with probability one. Host level.
 
     Args:
       on: the chain.
-      inside: the nodes among which it is sought, bool (*grid); ``None`` is all off the target.
-      dearest: actions of a higher running cost do not count; ``None`` for all.
+      inside: search among these nodes, bool (*grid); ``None`` means all nodes outside the target.
+      dearest: ignore actions with a higher running cost; ``None`` allows all.
     """
     start = cut_cells.level(on) > 0 if inside is None else inside
     u, d = (
@@ -235,7 +236,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
     )
     pairs = np.concatenate([np.repeat(u, len(d), axis=0), np.tile(d, (len(u), 1))], axis=1)
     count = len(pairs)
-    if dearest is not None:  # mostly few actions are cheap anywhere, and every one is tried again and again
+    if dearest is not None:  # usually few actions are cheap anywhere, and each is tried many times
         cheap = np.asarray(_cheap_somewhere(on, start, dearest, pairs))
         pairs, count = np.concatenate([pairs[cheap], pairs[~cheap]]), int(np.sum(cheap))
     return _refuge(on, start, dearest, pairs, count)
@@ -243,7 +244,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
 
 @jax.jit
 def _cheap_somewhere(on: Discretisation, inside: jax.Array, dearest: Scalar, pairs: Array) -> jax.Array:
-    """For every pair of actions, or those at the kinks next to it, if it costs at most ``dearest`` at some node."""
+    """For every pair of actions: True if it, or an action at a kink next to it, costs at most ``dearest`` somewhere."""
     mine = players_of(on).control
     m = len(mine.driven)
 
@@ -259,14 +260,14 @@ def _cheap_somewhere(on: Discretisation, inside: jax.Array, dearest: Scalar, pai
 def _refuge(
     on: Discretisation, start: jax.Array, dearest: Scalar | None, pairs: Array, count: int | Scalar
 ) -> jax.Array:
-    """``refuge`` in the set ``start`` by the first ``count`` rows of ``pairs``: the inputs of u, then those of d."""
+    """``refuge`` in the set ``start`` for the first ``count`` rows of ``pairs``, with the inputs of u, then of d."""
     mine, pairs = players_of(on).control, jnp.asarray(pairs, on.dtype)
     m = len(mine.driven)
 
     def shrink(carry):
         inside, _ = carry
 
-        # dear actions are left out where the refuge has to be free of cost
+        # expensive actions are excluded if the refuge has to be free of cost
         def kept(action, answer):
             allowed = ~edges.inadmissible(on, action, answer)
             if dearest is not None:
@@ -280,7 +281,7 @@ def _refuge(
 
         found = jnp.zeros(on.grid.shape, bool)
         for action in tried_actions.beside_samples(on, mine):
-            # with any disturbance: these are actions of one player, and a game has none
+            # for a single player only, since a game has no such additional actions
             found |= kept(action, list(pairs[0, m:]))
         found = inside & jax.lax.fori_loop(0, count, also, found)
         return found, jnp.any(found != inside)
@@ -289,7 +290,7 @@ def _refuge(
 
 
 def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) -> np.ndarray:
-    """The nodes with a path of jumps to a held node, bool (*grid)."""
+    """The nodes with a path of jumps to a fixed node, bool (*grid)."""
     lines, found, listed = _along_axes(jumps), held, grid.size * len(jumps.offsets) <= SEARCHABLE
     before, rounds = -1, 0
     while before < np.count_nonzero(found) < grid.size:
@@ -303,7 +304,7 @@ def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) ->
 
 
 def _along_axes(jumps: Rates) -> dict[int, list[tuple[tuple[int, ...], np.ndarray]]]:
-    """For every axis the jumps that lead along it, and along no axis before, as arrays that begin with that axis."""
+    """For every axis the jumps along it, and along no earlier axis, as arrays with that axis in front."""
     lines: dict[int, list] = {}
     for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
         axis = next(axis for axis, step in enumerate(offset) if step)
@@ -313,12 +314,12 @@ def _along_axes(jumps: Rates) -> dict[int, list[tuple[tuple[int, ...], np.ndarra
 
 
 def _swept(found: np.ndarray, axis: int, opened: list[tuple[tuple[int, ...], np.ndarray]]) -> np.ndarray:
-    """``found`` with the nodes that lead there by any number of equal jumps, one kind of jump after the other."""
+    """``found`` plus the nodes that lead there by any number of equal jumps, for one kind of jump after the other."""
     rows = np.array(np.moveaxis(found, axis, 0), order="C")
     sides = tuple(range(rows.ndim - 1))
     for (step, *aside), jump in opened:
         for k in range(len(rows))[:: -1 if step > 0 else 1]:
-            ahead = rows[(k + step) % len(rows)]  # no jump leads out of the box: on a periodic axis it leads round
+            ahead = rows[(k + step) % len(rows)]  # no jump leaves the box; on a periodic axis it wraps around
             if any(aside):
                 ahead = np.roll(ahead, [-each for each in aside], sides)
             rows[k] |= jump[k] & ahead
@@ -326,20 +327,20 @@ def _swept(found: np.ndarray, axis: int, opened: list[tuple[tuple[int, ...], np.
 
 
 def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
-    """The nodes with a path of jumps to a held node by a breadth-first search, however winding the paths are."""
+    """The nodes with a path of jumps to a fixed node, by breadth-first search, for long winding paths."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 
     starts = [np.flatnonzero(held)]
-    # the search wants one start: an extra node, numbered last, from which all held ones are one jump away
-    ends = [np.full_like(starts[0], grid.size)]  # one more node leads to all held ones
+    # the search requires a single start: an extra last node, from which all fixed nodes are one jump away
+    ends = [np.full_like(starts[0], grid.size)]  # the extra node leads to all fixed nodes
     for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
-        # jumps out of held nodes are left out: the run is over there
+        # jumps out of fixed nodes are omitted, because the run has ended there
         leaves = ~held & np.asarray(jump)
         starts.append(np.flatnonzero(leaves))
         ends.append(stencil.numbers(grid, offset)[leaves])
     backward = np.concatenate(ends), np.concatenate(starts)
-    # the jumps turned round: from the target to all from which it can be reached
+    # the reversed jumps lead from the target to all nodes that can reach it
     graph = csr_array((np.ones(len(backward[0])), backward), shape=(grid.size + 1, grid.size + 1))
     found = np.zeros(grid.size + 1, bool)
     found[breadth_first_order(graph, grid.size, directed=True, return_predecessors=False)] = True

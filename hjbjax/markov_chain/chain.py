@@ -1,8 +1,8 @@
-"""The Markov chain as other people's solvers take it: generator, transition matrix, long-run density, decision problem.
+"""Exports of the Markov chain: generator, transition matrix, stationary density, decision problem.
 
-Everything here works on the host, in float64, with the nodes in C order; ``rates`` in ``discretisation`` has the
-equations of the jump rates. With Q = Σ c the rate at which the chain leaves a node, the generator 𝓛 has c beside and
-−Q on its diagonal, and the transition matrix with one time step Δt for all nodes is I + Δt 𝓛.
+Everything here runs on the host in float64, with the nodes in C order. ``rates`` in ``discretisation`` has the
+equations of the jump rates c. Let Q = Σ c be the rate at which the chain leaves a node. The generator 𝓛 has the rates c
+off the diagonal and −Q on it. The transition matrix with one time step Δt for all nodes is I + Δt 𝓛.
 """
 
 from typing import Any
@@ -34,25 +34,25 @@ def generator(
     scheme: Chain = Upwind(),
     t: float = 0.0,
 ) -> Any:
-    """The generator of the chain under one policy as a sparse matrix; its rows sum to zero.
+    """The generator of the chain under a policy as a sparse matrix; its rows sum to zero.
 
-    (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)) is ``generator(...) @ V.ravel()``; the transpose moves densities,
-    dμ/dt = 𝓛*μ. The chain stays where it is on the target, and where the policy is NaN, which is how a
-    ``Solution`` marks nodes without an action.
+    (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)) is ``generator(...) @ V.ravel()``; the transpose evolves densities,
+    dμ/dt = 𝓛*μ. The chain stays where it is on the target, and at nodes without an action, where the policy of a
+    ``Solution`` is NaN.
 
     Args:
-      problem: the problem; its drift, its noise and its target matter.
+      problem: the problem; only drift, noise and target are used.
       grid: the grid, S nodes.
       policy: the control at every node, shape (*grid, m); ``None`` without controls.
       disturbance: the disturbance at every node, shape (*grid, l), in a game.
-      scheme: how the rates are made.
+      scheme: the chain that defines the rates.
       t: the time, if the problem depends on it.
 
     Returns:
       A SciPy CSR array of shape (S, S), per unit time.
 
     Raises:
-      ValueError: a policy of the wrong shape, rates that are not finite, or noise that the chain cannot represent.
+      ValueError: the policy has the wrong shape, rates are not finite, or the chain cannot represent the noise.
     """
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
     return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
@@ -68,14 +68,13 @@ def matrix(
     scheme: Chain = Upwind(),
     t: float = 0.0,
 ) -> Any:
-    """The transition matrix of the chain under one policy.
+    """The transition matrix of the chain under a policy.
 
-    P = I + Δt 𝓛 with one time step for all nodes, Δt = 1/max Q over the nodes under this policy (1 where
-    nothing moves), which is ``1 / -generator(...).diagonal().min()``. Arguments and errors are those of
-    ``generator``.
+    P = I + Δt 𝓛 with one time step for all nodes, Δt = 1/max Q over the nodes under this policy, which is
+    ``1 / -generator(...).diagonal().min()`` (1 if nothing moves). Arguments and errors as for ``generator``.
 
     Returns:
-      A SciPy CSR array of shape (S, S); no entry is negative, every row sums to one.
+      A SciPy CSR array of shape (S, S); all entries are non-negative, every row sums to one.
 
     Example:
       >>> import numpy as np
@@ -99,20 +98,21 @@ def stationary_density(
     scheme: Chain = Upwind(),
     t: float = 0.0,
 ) -> np.ndarray:
-    """The density in which the chain under one policy is found after a long time: 𝓛*p = 0, integral one.
+    """The stationary density of the chain under a policy: 𝓛*p = 0, with integral one.
 
-    The chain's law over the nodes, divided by the cells that its rates belong to: half cells at a wall on which noise
-    reflects, whole ones at an end of an axis without noise, which drift enters and leaves at |f|/h as inside. Then
-    scaled to the integral one over the box, ``np.sum(density * grid.volumes())``. Second order, up to the walls, where
-    central differences are monotone, first elsewhere; by a sparse LU factorisation, see ``stationary_law``. Arguments
-    are those of ``generator``.
+    It is the stationary probability of each node divided by the volume of its cell, and scaled so that
+    ``np.sum(density * grid.volumes())`` is one. The cell is half a cell at a wall on which noise reflects. It is a
+    whole cell at an end of an axis without noise, where drift enters and leaves at the rate |f|/h, as inside the box.
+    The density is second order, also at walls, where central differences are monotone, and first order elsewhere. It is
+    computed by a sparse LU factorisation, see ``stationary_law``. Arguments as for ``generator``.
 
     Returns:
-      The density at the nodes, shape (*grid), in 1/(units of the states); zero where the chain never comes back.
+      The density at the nodes, shape (*grid), in 1/(units of the states); zero at transient nodes.
 
     Raises:
-      ValueError: a target, where paths end; several recurrent classes, or one that hangs together by no more than
-        rounding: then where the chain is found depends on where it started; and what ``generator`` refuses.
+      ValueError: the problem has a target, where paths end; there are several recurrent classes, or one that is
+      connected only by rates of the size of rounding, so that the distribution depends on the start; or ``generator``
+      raises.
 
     Example:
       >>> import numpy as np
@@ -121,10 +121,10 @@ def stationary_density(
       >>> float(round(density[80], 3)), float(round(np.sum(density * grid.volumes()), 12))  # 1/√π
       (0.564, 1.0)
     """
-    if problem.target is not None:  # the law would be a point at the target, which is no density
+    if problem.target is not None:  # the stationary law would be a point mass on the target
         raise ValueError(
-            "stationary_density: got a problem with a target, where paths end, so that nothing goes on for ever; leave "
-            "it out, or ask for hjb.reach_probability or hjb.expected_exit_time"
+            "stationary_density: got a problem with a target, where paths end, so no density is stationary; leave "
+            "it out, or use hjb.reach_probability or hjb.expected_exit_time"
         )
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
     moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
@@ -146,28 +146,29 @@ def transition_arrays(
 ) -> tuple[np.ndarray, Any, np.ndarray, np.ndarray, float]:
     """The controlled chain as a discounted Markov decision problem over pairs of state and action.
 
-    On one Δt = 1/max Q, over states and actions, the equation (β − 𝓛^u)V = L^u minimised over u is
+    With one Δt = 1/max Q over states and actions, the equation (β − 𝓛^u)V = L^u minimised over u is
 
         V = min_u [ L^u Δt + P^u V ] / (1 + βΔt),
 
-    so that with cost L Δt/(1 + βΔt) and factor 1/(1 + βΔt) the decision problem has our value V_h exactly. A
-    target keeps its state, at a cost of (1 − factor) times its exit cost; where ``scheme.subcell`` ends a jump on the
-    boundary, the difference of the exit costs there and at the node is part of L. QuantEcon maximises: its
-    ``DiscreteDP(-costs, probabilities, factor, state_index, action_index)`` has the value −V_h. Works in about
-    20 (2n + 2) bytes a pair.
+    so the decision problem with cost L Δt/(1 + βΔt) and factor 1/(1 + βΔt) has exactly the value V_h. A target node
+    keeps its state, at a cost of (1 − factor) times its exit cost. If ``scheme.subcell`` ends a jump on the boundary of
+    the target, L includes the difference between the exit costs at the boundary and at the node. QuantEcon maximises,
+    so its ``DiscreteDP(-costs, probabilities, factor, state_index, action_index)`` has the value −V_h. Requires about
+    20 (2n + 2) bytes per pair.
 
     Args:
-      problem: discounted, without opponent or constraints, with K ``Finite`` controls, or None (K = 1).
+      problem: discounted, without disturbances or constraints, with K ``Finite`` controls, or None (K = 1).
       grid: the grid, S nodes.
-      scheme: how the rates are made.
+      scheme: the chain that defines the rates.
 
     Returns:
       ``(costs (S*K,), probabilities CSR (S*K, S), state_index (S*K,), action_index (S*K,), discount_factor)``,
       sorted by state, then by action; pairs that lead out of the box across a constrained end are left out.
 
     Raises:
-      ValueError: a problem that is no such decision problem, rates or costs that are not finite, or noise that
-        the chain cannot represent.
+      ValueError: the problem is not such a decision problem, rates or costs are not finite, or the chain cannot
+        represent
+      the noise.
     """
     grid.check_indices()
     actions = decision_process.actions(problem)
@@ -187,11 +188,11 @@ def transition_arrays(
 
 
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
-    """The rates under a policy; zero on the target and where there is no action."""
+    """The rates under a policy; zero on the target and at nodes without an action."""
     grid.check_indices()
     u, d, active = decision_process.policies(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
-    # what is rounding is told by the type in which the policy was found: one of float32 is off by 1e-7 at an end
+    # the dtype of the policy determines what counts as rounding: float32 is off by 1e-7 at an end
     kinds = [np.asarray(array).dtype for array in (policy, disturbance) if array is not None]
     eps = max([np.finfo(kind).eps for kind in kinds if kind.kind == "f"], default=np.finfo(np.float64).eps)
     jumps, _, leaving = _checked(Discretisation(problem, grid, scheme, np.float64, t), u, d, active, eps)
@@ -202,15 +203,15 @@ def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, s
 def _checked(
     on: Discretisation, u: list, d: list | None, active: np.ndarray, eps: Any
 ) -> tuple[Rates, np.ndarray, np.ndarray]:
-    """Rates and running cost at the ``active`` nodes, zero elsewhere, and where an end forbids the actions there.
+    """Rates and running cost at the ``active`` nodes, zero elsewhere, and the nodes where an end forbids the actions.
 
-    Refuses what is not usable.
+    Refuses rates and costs that cannot be exported.
     """
     grid = on.grid
-    grid.refuse_prescribed("chain", "whose payments a table of rates and running costs does not hold")
+    grid.refuse_prescribed("chain", "whose payments do not fit into a table of rates and running costs")
     if grid.sides("open"):
         raise ValueError(
-            "chain: a grid with open ends has no chain: a value that is continued from inside makes negative "
+            "chain: a grid with open ends has no chain: extrapolating the value beyond them gives negative "
             "probabilities; choose edges='projected' or 'constrained'"
         )
     with own_settings(x64=True):
@@ -226,7 +227,7 @@ def _checked(
 
 @jax.jit
 def _evaluate(on: Discretisation, u: list, d: list | None, eps: Any) -> Any:
-    """Rates and running cost at the nodes, where the noise leaves a negative rate, and where an end is crossed."""
+    """Rates, running cost, the nodes where the noise leaves a negative rate, and the nodes that cross an end."""
     jumps, shape = jump_rates(on, u, d), on.grid.shape
     cost, short = jnp.broadcast_to(on.running_cost(u, d), shape), correlated_noise.lacking(on, on.diffusion(u, d))
     leaving = edges.inadmissible(on, u, d, eps=eps)

@@ -1,7 +1,7 @@
-"""A chain in the forms that other people's solvers read: SciPy's sparse matrices, QuantEcon's pairs.
+"""The chain in the formats of other solvers: SciPy's sparse matrices, QuantEcon's state-action pairs.
 
-Host level, float64, nodes in C order. What depends on how rates are made is ``chain``'s; here is what the exports
-ask of a problem and a policy, and how their arrays are laid out.
+Host level, float64, nodes in C order. ``chain`` computes the rates; this module checks problem and policy for the
+exports, and lays out their arrays.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,7 +30,7 @@ Table = tuple[Offsets, Sequence[np.ndarray], np.ndarray, np.ndarray]
 
 
 class Jumps(Protocol):
-    """The jumps of a chain and the rate of each at every node, as ``rates.Rates`` holds them."""
+    """The jumps of a chain and their rates at the nodes, as in ``rates.Rates``."""
 
     @property
     def offsets(self) -> Offsets:
@@ -38,19 +38,19 @@ class Jumps(Protocol):
 
     @property
     def values(self) -> Sequence[np.ndarray]:
-        """For each jump its rates per unit time, (*grid)."""
+        """The rates of each jump per unit time, (*grid)."""
 
 
 def time_step(leaving: np.ndarray) -> float:
-    """Δt = 1/max Q, the longest with which no probability is negative; 1 where nothing moves."""
+    """Δt = 1/max Q, the largest for which all probabilities are non-negative; 1 if nothing moves."""
     fastest = float(np.max(leaving))
     return 1 / fastest if fastest > 0 else 1.0
 
 
 def refuse(what: str, where: Mask, grid: Grid, name: str = "chain") -> None:
-    """Raise a ValueError that names the fault ``what``, its count of nodes and the first, if it is at any.
+    """Raise a ValueError with the fault ``what``, the number of nodes and the first node, if there are any.
 
-    ``name``: who refuses. Traced nodes pass.
+    ``name`` is the function named in the message. Traced nodes pass.
     """
     if not is_traced(where) and np.any(where):
         first = tuple(int(i) for i in np.argwhere(where)[0])
@@ -62,20 +62,20 @@ def single_law(classes: list[np.ndarray], generator: "csr_array", grid: Grid) ->
     """The stationary probabilities of a chain with one recurrent class, shape (S,).
 
     Raises:
-      ValueError: more than one class, or one that rounding may take for several.
+      ValueError: there is more than one class, or rounding may split the class.
     """
     why = "where the chain is found after a long time depends on where it starts"
-    fix = "connect them by noise, or look at a part of the box by itself"
+    fix = "connect them by noise, or restrict the box to one part"
     if len(classes) > 1:
         first = [np.array2string(grid.state(np.unravel_index(c[0], grid.shape)), separator=", ") for c in classes[:2]]
         raise ValueError(
-            f"stationary_density: got {len(classes)} recurrent classes, wanted one: {why};\nthe first two hold the "
+            f"stationary_density: got {len(classes)} recurrent classes, wanted one: {why};\nthe first two contain the "
             f"states {first[0]} and {first[1]}, {len(classes[0])} and {len(classes[1])} nodes; {fix}"
         )
     probabilities, error = stationary_law.law(generator, classes[0])
     if error > stationary_law.LARGEST_ERROR:
         raise ValueError(
-            f"stationary_density: parts of the box exchange so little that rounding alone may move {error:.2g} of the "
+            f"stationary_density: parts of the box exchange so little that rounding may move {error:.2g} of the "
             f"probability between them, wanted at most {stationary_law.LARGEST_ERROR:g}:\n{why}; {fix}"
         )
     return probabilities
@@ -83,7 +83,7 @@ def single_law(classes: list[np.ndarray], generator: "csr_array", grid: Grid) ->
 
 def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """The nodes on the target, bool, and the exit cost; both (*grid)."""
-    # in double precision whatever the session's: an export is read by others, who solve in double
+    # double precision regardless of the session's, because other solvers use double precision
     with own_settings(x64=True):
         on = Discretisation(problem, grid, Upwind(), np.dtype(np.float64), t)
         paid = np.asarray(on.at_nodes(problem.exit_cost))
@@ -99,54 +99,55 @@ def policies(
     """The components of both players' policies, each (*grid), and the nodes where no entry is NaN."""
     u = _entries(policy, problem.controls, grid, "policy")
     d = _entries(disturbance, problem.disturbances, grid, "disturbance")
-    # a solution marks nodes without an action by NaN; drift and cost are evaluated there all the same, at zero
+    # a solution marks nodes without an action by NaN; drift and cost are evaluated there with zeros
     active = ~np.any(np.isnan(np.concatenate([u, d], axis=-1)), axis=-1)
     return *(list(np.moveaxis(np.where(active[..., None], action, 0), -1, 0)) for action in (u, d)), active
 
 
 def _entries(action: ArrayLike | None, admissible: AdmissibleSet | None, grid: Grid, name: str) -> np.ndarray:
-    """One player's action at every node, (*grid, m); of no inputs where there is no such player."""
+    """One player's action at every node, (*grid, m); m = 0 if there is no such player."""
     wanted = (*grid.shape, 0 if admissible is None else admissible.dim)
     entries = np.zeros(wanted) if action is None and admissible is None else np.asarray(action, np.float64)
     if entries.shape != wanted:
-        raise ValueError(f"chain: got a {name} of shape {entries.shape}, wanted {wanted}: one action a node")
+        raise ValueError(f"chain: got a {name} of shape {entries.shape}, wanted {wanted}: one action per node")
     if np.any(np.isinf(entries)):
         raise ValueError(f"chain: the {name} is infinite at some node; wanted numbers, or NaN where there is no action")
     return entries
 
 
 def actions(problem: Problem) -> np.ndarray:
-    """The K actions of a discounted decision problem, shape (K, m); refuses what is none.
+    """The K actions of a discounted decision problem, shape (K, m).
 
     Raises:
-      ValueError: a game, no discount, constraints, time, or controls that are not finitely many.
+      ValueError: the problem is a game, has no discount, has constraints, depends on time, or its controls are not
+        finite.
     """
     if problem.is_game:
         raise ValueError("transition_arrays: got a game; a decision problem has one player. Leave out disturbances")
     if not problem.discount > 0:
         raise ValueError(
             "transition_arrays: got discount = 0, wanted > 0: the factor would be 1, and stationary decision problems "
-            "need one below (QuantEcon's methods refuse 1)"
+            "require a factor < 1 (QuantEcon's methods refuse 1)"
         )
     if is_constrained(problem):
         raise ValueError("transition_arrays: got a stopping_cost or running_max, which a decision problem cannot hold")
     if problem.time_dependent:
         raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")
     if problem.controls is None:
-        return np.zeros((1, 0))  # one action without inputs: a chain that nobody controls
-    if not isinstance(problem.controls, Finite):  # how finely a continuum is sampled is the user's choice
+        return np.zeros((1, 0))  # a single action without inputs: an uncontrolled chain
+    if not isinstance(problem.controls, Finite):  # the resolution of the sampling is the user's choice
         kind = type(problem.controls).__name__
-        raise ValueError(f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, as by Box.grid(num)")
+        raise ValueError(f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, e.g. Box.grid(num)")
     return np.asarray(problem.controls.points, np.float64)
 
 
 def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> dict[tuple[int, ...], np.ndarray]:
-    """For each jump the exit cost on the boundary of the target minus that of the node beyond it, (*grid)."""
+    """For each jump the exit cost on the boundary of the target minus the exit cost of the node behind it, (*grid)."""
     extra = {}
     for axis, link in enumerate(links):
         for step, meets in ((1, link.meets_up), (-1, link.meets_down)):
             if meets is not None:
-                # the table pays the exit cost of the node beyond, the cut link that of the crossing
+                # the table pays the exit cost of the node behind the boundary, a cut link that at the crossing
                 offset = stencil.unit(grid, axis, step)
                 beyond = np.asarray(stencil.neighbour(jax.numpy.asarray(given), grid, offset))
                 crosses, there = (np.asarray(entry) for entry in meets)
@@ -155,22 +156,22 @@ def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> 
 
 
 def paid(jumps: Jumps, extra: dict[tuple[int, ...], np.ndarray]) -> np.ndarray | float:
-    """The surcharges per unit time: Σ_o c_o extra_o."""
+    """The surcharges per unit time, Σ_o c_o extra_o."""
     return sum(c * extra.get(offset, 0.0) for offset, c in zip(jumps.offsets, jumps.values, strict=True))
 
 
 def decision_problem(
     tables: Iterable[Table], grid: Grid, count: int, held: np.ndarray, given: np.ndarray, discount: float
 ) -> tuple[np.ndarray, "csr_array", np.ndarray, np.ndarray, float]:
-    """Costs, probabilities, indices and factor over pairs of state and action; see ``chain.transition_arrays``.
+    """Costs, probabilities, indices and factor for pairs of state and action; see ``chain.transition_arrays``.
 
     Args:
-      tables: for each action the offsets, the rates, the running cost and where it is admissible; one action in
-        memory at a time.
+      tables: for each action the offsets, the rates, the running cost and the nodes where it is admissible; only one
+        action is in memory at a time.
       grid: the grid.
       count: the number K of actions.
       held: the nodes of the target, where the tables are zero.
-      given: the exit cost there.
+      given: the exit cost on the target.
       discount: β.
     """
     from scipy.sparse import csr_array
@@ -184,26 +185,26 @@ def decision_problem(
         costs[:, k], admissible[:, k] = cost.ravel(), allowed.ravel()
         for column, c in enumerate(values):
             entries[:, k, column] = c.ravel()
-    # (S, K, offsets + 1): one Δt for all states and actions, as a decision problem with one factor wants it
+    # (S, K, offsets + 1): one Δt for all states and actions, because the decision problem has a single factor
     leaving = entries[..., :-1].sum(axis=-1)
     dt = time_step(leaving)
     entries[..., :-1] *= dt
-    entries[..., -1] = np.maximum(1 - leaving * dt, 0)  # of the fastest row 1 − 1, which may round below zero
+    entries[..., -1] = np.maximum(1 - leaving * dt, 0)  # 1 − 1 in the fastest row, which may round below zero
     factor = 1 / (1 + discount * dt)
-    # a target keeps its state: (1 − γ) g a step for ever is worth g
+    # a target keeps its state: (1 − γ) g per step, for all steps, is worth g
     paid = np.where(held.reshape(-1, 1), (1 - factor) * given.reshape(-1, 1), factor * dt * costs)
-    # 32-bit indices halve the memory; SciPy wants 64 bits where the row pointers outgrow them
+    # 32-bit indices halve the memory; SciPy requires 64 bits for longer row pointers
     number = np.arange(grid.size, dtype=np.int32 if entries.size < 2**31 else np.int64).reshape(grid.shape)
-    # every row has the entries of all jumps, so that the row pointers are an arithmetic sequence
+    # every row has the entries of all jumps, so the row pointers are an arithmetic sequence
     ends = [np.roll(number, [-step for step in offset], axis=range(grid.ndim)) for offset in offsets]
     columns = np.stack([end.ravel() for end in (*ends, number)], axis=-1)[:, None, :]
     starts = np.arange(0, entries.size + 1, entries.shape[-1], dtype=number.dtype)
     layout = (entries.ravel(), np.repeat(columns, count, axis=1).ravel(), starts)
     probabilities = csr_array(layout, shape=(costs.size, grid.size))
-    probabilities.sum_duplicates()  # a jump over the seam of an axis with two nodes; sorts the columns as well
+    probabilities.sum_duplicates()  # jumps across the seam of an axis with two nodes coincide; also sorts the columns
     probabilities.eliminate_zeros()
     refuse(
-        "no action is admissible: all lead out across a constrained end",
+        "no action is admissible: all actions leave the box across a constrained end",
         np.logical_not(np.any(admissible, axis=1)).reshape(grid.shape),
         grid,
     )

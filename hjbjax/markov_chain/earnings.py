@@ -1,8 +1,8 @@
-"""Costs that are earned for ever: what makes an undiscounted value −∞.
+"""Detection of undiscounted values of −∞: costs that are earned indefinitely.
 
-A policy under which the chain, once in a class of nodes, never leaves it pays there the mean of the running cost under
-the stationary law of the class, per unit time. If that is negative the value is −∞ at every node of the class: no
-iteration that is stopped by the size of its steps can say so, since V falls by the same amount in each of them.
+If the chain never leaves a class of nodes under some policy, it pays the mean running cost under the stationary law of
+the class, per unit time. If this mean is negative, the value is −∞ at every node of the class. An iteration that stops
+by the size of its steps cannot detect this, because V falls by the same amount in each step.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -21,7 +21,7 @@ from hjbjax.problem.types import Field
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-LARGEST = 200_000  # nodes of a class whose stationary law is solved for; of a larger one every node must earn
+LARGEST = 200_000  # largest class whose stationary law is computed; in a larger class every node must earn
 
 
 class Earning(NamedTuple):
@@ -37,30 +37,30 @@ class Earning(NamedTuple):
 
 
 def earned(task: Task, state: State) -> Earning | None:
-    """The first class of nodes in which the greedy policy earns for ever; ``None`` if it has none.
+    """The first class of nodes in which the greedy policy earns indefinitely; ``None`` if there is none.
 
-    Host level, for one player; a game's answer to it would be another policy.
+    Host level, for one player, because in a game the opponent would respond with another policy.
     """
     problem = task.problem
-    # a certificate bounds the value, and so does a discount: only what has neither can fall for ever
+    # a certificate or a discount bounds the value, so V can fall indefinitely only without both
     bounded = task.certificate is not Certificate.NONE or problem.discount != 0
     if bounded or problem.is_game or problem.cost is None or int(state.step) < 0:
         return None
     jumps, cost = jax.device_get(_rates_and_cost(task, state.policy.controls))
-    # held nodes end the run: in the chain they are absorbing
+    # fixed nodes end the run: they are absorbing in the chain
     going = np.asarray(task.counted) & ~np.asarray(task.obstacles.fixed)
-    # only a class in which some node earns can earn on the average
+    # a class can earn on average only if some node earns
     if not np.all(np.isfinite(cost[going])) or not np.any(cost[going] < 0):
         return None
-    # rows sum to zero, which is what makes it a generator
+    # the rows of a generator sum to zero
     values = [np.where(going, rate, 0) for rate in jumps.values]
     generator = stencil.sparse(jumps.offsets, values, -np.sum(values, axis=0), task.grid)
     for states in stationary_law.classes(generator):
-        # a held node is a class of its own, where nothing is paid any more
+        # a fixed node is a separate class, without further payments
         if not going.flat[states[0]]:
             continue
         paid = cost.flat[states]
-        # where every node earns no law is needed: the mean is at most the largest cost
+        # if every node earns, no law is needed: the mean is at most the largest cost
         mean = float(np.max(paid)) if np.all(paid < 0) else _mean_cost(generator, states, cost)
         if mean < 0:
             return Earning(mean, tuple(int(i) for i in np.unravel_index(states[0], task.grid.shape)))
@@ -75,10 +75,10 @@ def _rates_and_cost(task: Task, controls: tuple[Field, ...]) -> tuple[Rates, Fie
 
 
 def _mean_cost(generator: "csr_array", states: np.ndarray, cost: np.ndarray) -> float:
-    """An upper bound on the mean cost of a class: with what rounding may do to its stationary law."""
+    """An upper bound on the mean cost of a class, including the effect of rounding on its stationary law."""
     if len(states) > LARGEST or not np.any(cost.flat[states] < 0):
         return np.inf
     probabilities, error = stationary_law.law(generator, states)
     paid = cost.flat[states]
-    # a law off by ‖Δp‖₁ changes the mean by ‖Δp‖₁ max|L| at most: −∞ is claimed only if that leaves it negative
+    # an error ‖Δp‖₁ of the law changes the mean by at most ‖Δp‖₁ max|L|; the mean must stay negative after adding it
     return float(probabilities[states] @ paid + error * np.max(np.abs(paid))) if np.isfinite(error) else np.inf

@@ -1,8 +1,7 @@
-"""What a problem must satisfy at every node before a solve starts; host level, never under a tracer.
+"""Checks of a problem at every node before a solve starts; host level, never under a tracer.
 
-All functions are evaluated at all nodes for representative actions. A first pass finds out whether anything is amiss,
-which compiles fast; a second one, where it is needed, reduces on the fly to counts and first nodes, so that what is
-refused can be named.
+All functions are evaluated at all nodes for representative actions. A first pass, which compiles fast, detects any
+fault. If there is one, a second pass computes counts and first nodes for the error message.
 """
 
 import dataclasses
@@ -26,34 +25,34 @@ from hjbjax.solution.clock import Clock
 from hjbjax.tracing import components
 from hjbjax.tracing.checks import OF_ACTION, STATE_COSTS, call
 
-ACTIONS = 33  # at most so many actions of one player are tried, 9 where both play; ends and middle are among them
-LOOK = 10**7  # nodes times actions between two looks at the clock: about a second of a drift with some sines
+ACTIONS = 33  # largest number of actions of one player, 9 per player in a game; includes ends and middle
+LOOK = 10**7  # nodes times actions between two checks of the clock: about a second for a drift with some sines
 
 
 def values(on: Discretisation, clock: Clock | None = None) -> None:
-    """Refuse a problem by its numbers at the nodes: NaN, an empty target, noise or drift that no chain can represent.
+    """Refuse a problem by its values at the nodes: NaN, an empty target, noise or drift that no chain can represent.
 
     Args:
-      on: the problem, one that passed ``checks.shapes``, on its grid; the functions are evaluated in its type, and its
-        chain is looked at where that is the user's own.
-      clock: where a limit is looked at on the way, between some actions and others; ``Stopped`` leaves then.
+      on: the problem on its grid; must have passed ``checks.shapes``. The functions are evaluated in its dtype. The
+        chain is checked too if it is a custom one.
+      clock: checks the limits between batches of actions; raises ``Stopped``.
 
     Raises:
-      ValueError: with the number of nodes, the first of them and its state, and what to do.
+      ValueError: a value is refused; names the number of nodes, the first one with its state, and a remedy.
     """
     clock, problem, grid, scheme = clock or Clock(), on.problem, on.grid, on.scheme
     actions = _actions(problem)
-    # one program for all schemes whose chain is right by construction
+    # one compiled program for all schemes whose chain is correct by construction
     chain = Upwind() if isinstance(scheme.chain, Upwind) else scheme.chain
     on = dataclasses.replace(on, scheme=chain).settled
-    # for counts of 64 bits; the functions are evaluated in ``dtype`` all the same
+    # x64 for 64-bit counts; the functions are still evaluated in ``dtype``
     with own_settings(x64=True):
-        # nearly every problem passes, and is spared counts and first nodes, which are slow on a CPU
+        # nearly every problem passes and skips the counts and first nodes, which are slow on a CPU
         if _all_pass(on, actions, clock):
             return
         clock.look()
         found = jax.device_get(_survey(on, actions))
-    # what is not finite first: comparisons with NaN are false, so that the rest would speak of something else
+    # values that are not finite first: comparisons with NaN are false, which would hide the cause
     for name in (*OF_ACTION, "target", *STATE_COSTS):
         if name in found and found[name].nodes:
             _refuse_not_finite(problem, grid, name, found[name], actions)
@@ -69,14 +68,14 @@ def values(on: Discretisation, clock: Clock | None = None) -> None:
         raise ValueError(
             f"scheme: the chain of {scheme!r} has too little diffusion at "
             f"{_where(problem, grid, found['diffusion'], actions)}.\nWanted e ≥ max(a, h⁺ f, −h⁻ f) along every axis: "
-            "with less it carries a part of the drift alone, and its value is that of another problem"
+            "with less, the chain represents only a part of the drift"
         )
     if problem.target is not None:
         _check_target(problem, grid, int(found["inside"]), found["nearest"])
 
 
 class _Finding(NamedTuple):
-    """The number of nodes at fault, the first of them, counted flat, and the number of the action."""
+    """The number of faulty nodes, the flat index of the first, and the index of the action."""
 
     nodes: Array
     first: Array
@@ -87,13 +86,13 @@ def _actions(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Representative pairs of control and disturbance, shapes (K, m) and (K, l)."""
     most = 9 if problem.is_game else ACTIONS
     mine, theirs = (_representatives(admissible, most) for admissible in (problem.controls, problem.disturbances))
-    # all pairs, 81 of them at most: a game's functions may fail for one pair alone
+    # all pairs, at most 81, because the functions of a game may fail for a single pair
     pairs = list(itertools.product(mine, theirs))
     return np.array([u for u, _ in pairs]), np.array([d for _, d in pairs])
 
 
 def _representatives(admissible: sets.AdmissibleSet | None, most: int) -> np.ndarray:
-    """At most so many actions of one player, shape (K, m), the first and the last of its samples among them."""
+    """At most ``most`` actions of one player, shape (K, m), including the first and the last of its samples."""
     if admissible is None:
         return np.zeros((1, 0))
     points = np.asarray(sets.samples(admissible, 9))
@@ -101,10 +100,10 @@ def _representatives(admissible: sets.AdmissibleSet | None, most: int) -> np.nda
 
 
 def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock: Clock) -> bool:
-    """True if ``values`` refuses nothing, some actions at a time."""
+    """True if ``values`` refuses nothing; evaluates some actions at a time."""
     count, some = len(actions[0]), max(1, LOOK // on.grid.size)
-    # in lots of about a second: ten million nodes and 33 actions take half a minute; all lots are one program, since
-    # first and last are arguments
+    # In batches of about a second, as ten million nodes and 33 actions take half a minute. All batches use one program,
+    # because first and last are arguments.
     for first in range(0, count, some):
         clock.enter(f"the survey of the nodes, {first} of {count} actions")
         if not _actions_pass(on, actions, first, min(first + some, count)):
@@ -114,28 +113,28 @@ def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock:
 
 @jax.jit
 def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar) -> Verdict:
-    """True if nothing is refused of the actions from ``first`` to before ``last``; with the first, of the state."""
-    # the state is looked at once, with the first lot
+    """True if no action from ``first`` to before ``last`` is at fault; the first batch also checks the state."""
+    # functions of the state are checked once, with the first batch
     amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
     x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)
 
     def look(k, amiss):
         here, (u, d) = jax.lax.optimization_barrier((x, jax.tree.map(lambda rows: rows[k], tried)))  # see _survey
         bad = _faults(on, here, list(u), list(d)).values()
-        # as numbers: of truth values XLA would make two passes
+        # as integers: for booleans XLA would make two passes
         return amiss | (jnp.max(functools.reduce(jnp.logical_or, bad).astype(jnp.int32)) > 0)
 
     return ~jax.lax.fori_loop(first, last, look, amiss)
 
 
 def _state_fails(on: Discretisation) -> Verdict:
-    """True if ``values`` refuses numbers that the functions of the state alone return."""
+    """True if ``values`` refuses the values of the functions of the state."""
     problem = on.problem
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
         distance = cut_cells.level(on)
         inside = distance <= 0
-        # a target that no node meets, or that all do, leaves no problem
+        # a target that contains no node, or all nodes
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
@@ -156,7 +155,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
         inside = distance <= 0
         found["target"] = _count(~jnp.isfinite(distance), grid)
         found["inside"] = jnp.sum(inside)
-        # the least value tells how much too coarse the grid is, or how much too small the target
+        # the least value shows how much too coarse the grid is, or how much too small the target
         found["nearest"] = (jnp.min(distance), jnp.argmin(distance))
     for name in STATE_COSTS:
         ingredient = getattr(problem, name)
@@ -166,7 +165,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
 
     def body(carry, index_and_action):
         index, u, d = index_and_action
-        here, u, d = jax.lax.optimization_barrier((x, u, d))  # or XLA keeps an array of all nodes per invariant
+        here, u, d = jax.lax.optimization_barrier((x, u, d))  # otherwise XLA keeps an array of all nodes per invariant
         new = {name: _count(bad, grid, index) for name, bad in _faults(on, here, list(u), list(d)).items()}
         kept = {
             name: jax.tree.map(functools.partial(jnp.where, carry[name].nodes > 0), carry[name], new[name])
@@ -175,7 +174,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
         return kept, None
 
     us, ds = (jnp.asarray(action, on.dtype) for action in actions)
-    # the first action at fault is kept, with its own count, and not the sum over all actions
+    # keep the first action at fault and its count, not the sum over all actions
     nothing = _Finding(*(jnp.zeros((), jnp.int64),) * 3)
     names = jax.eval_shape(lambda: _faults(on, x, list(us[0]), list(ds[0])))
     carry, _ = jax.lax.scan(body, dict.fromkeys(names, nothing), (jnp.arange(len(us)), us, ds))
@@ -183,13 +182,13 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
 
 
 def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, Mask]:
-    """The nodes at which drift, cost and noise are not as they must be under one action, by the name of the fault."""
+    """The nodes where drift, cost or noise is faulty under one action, by the name of the fault."""
     problem = on.problem
 
     def faulty(entries):
         return functools.reduce(jnp.logical_or, (~jnp.isfinite(jnp.asarray(entry, on.dtype)) for entry in entries))
 
-    # only what is there: a problem without cost or noise compiles no look at it
+    # a problem without cost or noise does not compile their checks
     bad = {"drift": faulty(on.drift(u, d, x))}
     if problem.cost is not None:
         bad["cost"] = faulty([on.running_cost(u, d, x)])
@@ -198,14 +197,14 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, M
         bad["noise"] = faulty(a.values())
     if callable(problem.noise):
         sigma = components.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=on.dtype)
-        # entries of a matrix may be negative, as a correlation is; a number or a diagonal is a size
+        # entries of a matrix may be negative, like correlations; a number or a diagonal is a size
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
-    # jumps along diagonals take their rates from those along the axes, which must not fall below zero
+    # diagonal jumps take their rates from the jumps along the axes, which must not become negative
     lacking = correlated_noise.lacking(on, a)
     if lacking is not None:
         bad["correlation"] = lacking
-    if on.scheme != Upwind():  # a chain of the user's own
+    if on.scheme != Upwind():  # a custom chain
         links = [stencil.links(on.grid, axis) for axis in range(on.grid.ndim)]
         short = [
             schemes.falls_short(on.scheme.chain, part[axis], correlated_noise.along_axis(a, on.grid, axis), link)
@@ -217,9 +216,9 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, M
 
 
 def _count(bad: Mask, grid: Grid, action: int | Scalar = 0) -> _Finding:
-    """The finding of the nodes ``bad`` under an action, by its number."""
+    """The finding for the nodes ``bad`` under the action with this index."""
     bad = jnp.broadcast_to(bad, grid.shape)
-    # counting and argmax are slow on a CPU: they run where there is something to find
+    # counting and argmax are slow on a CPU, so they run only if there is a fault
     count, first = jax.lax.cond(
         jnp.any(bad),
         lambda: (jnp.sum(bad, dtype=jnp.int64), jnp.argmax(bad).astype(jnp.int64)),
@@ -228,16 +227,16 @@ def _count(bad: Mask, grid: Grid, action: int | Scalar = 0) -> _Finding:
     return _Finding(count, first, jnp.asarray(action, jnp.int64))
 
 
-# --- what is said ---
+# --- messages ---
 
 
 def _numbers(entries: Numbers) -> str:
-    """A vector as it is printed in a refusal."""
+    """Format a vector for a message."""
     return "[" + ", ".join(f"{entry:.6g}" for entry in np.asarray(entries, dtype=float)) + "]"
 
 
 def _place(grid: Grid, flat: Array) -> tuple[tuple[int, ...], np.ndarray]:
-    """The index and the state of a node that is counted flat."""
+    """The index and the state of a node from its flat index."""
     index = tuple(int(i) for i in np.unravel_index(int(flat), grid.shape))
     return index, grid.state(index)
 
@@ -256,7 +255,7 @@ def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple[np.nd
 def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, actions: tuple) -> NoReturn:
     """Refuse a function that is NaN or infinite at some nodes."""
     ingredient = getattr(problem, name)
-    # a plain number is at fault everywhere, and no node need be named
+    # a constant is at fault everywhere, so no node is named
     if not callable(ingredient):
         raise ValueError(f"Problem.{name}: got {np.asarray(ingredient)}, wanted finite numbers")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
@@ -268,7 +267,7 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
 
 
 def _check_target(problem: Problem, grid: Grid, inside: int, nearest: tuple[Array, Array]) -> None:
-    """Refuse a target in which no node lies, or all; ``nearest`` is its least value and the node of that."""
+    """Refuse a target with no node or all nodes; ``nearest`` is the least value and its node."""
     if 0 < inside < grid.size:
         return
     if inside:
@@ -284,7 +283,7 @@ def _check_target(problem: Problem, grid: Grid, inside: int, nearest: tuple[Arra
 
 
 def _refuse_noise(on: Discretisation, finding: _Finding, actions: tuple) -> NoReturn:
-    """Refuse correlated noise, with spacings for which its diagonal jumps leave no negative probability."""
+    """Refuse correlated noise for which the diagonal jumps leave a negative probability at these spacings."""
     _, x = _place(on.grid, finding.first)
     u, d = (rows[finding.action] for rows in actions)
     sigma = np.asarray(on.problem.diffusion(x, u, d, 0.0), dtype=float)
@@ -295,6 +294,6 @@ def _refuse_noise(on: Discretisation, finding: _Finding, actions: tuple) -> NoRe
 
 
 def representatives(problem: Problem, u: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs of actions that are tried, and one more, shapes (K, m) and (K, l)."""
+    """The representative pairs of actions, and one more, shapes (K, m) and (K, l)."""
     us, ds = _actions(problem)
     return np.concatenate([us, [u]]), np.concatenate([ds, [d]])

@@ -1,11 +1,10 @@
-"""Nodes where the system can rest at no cost, which close an undiscounted problem, and whether leaving them pays.
+"""Nodes where the system can rest at no cost, which close an undiscounted problem, and the gain of leaving them.
 
-At a node where some action has f = 0, L = 0 and no noise the run may stay for ever and pay nothing: V ≤ 0 there.
-Where no path can earn anything V = 0, and the node is held at it like a target. Where some can (a negative exit cost,
-a negative running cost elsewhere), leaving may be better: whether it is, the answer with held rest nodes tells.
+If some action has f = 0, L = 0 and no noise at a node, the run may stay there indefinitely and pay nothing, so V ≤ 0.
+If no path can earn anything, V = 0 and the node is fixed at zero like a target. If some path can (a negative exit cost,
+a negative running cost elsewhere), leaving may be better; the value computed with fixed rest nodes decides.
 
-"No cost" and "no motion" mean: less than rounding beside the largest cost and beside the largest speed on the grid,
-each in its own unit.
+"No cost" and "no motion" mean less than rounding relative to the largest cost and the largest speed on the grid.
 """
 
 from typing import NamedTuple
@@ -23,17 +22,17 @@ from hjbjax.problem.pytree import altered
 from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Field, Mask, Numbers, Scalar
 
-ROUNDINGS = 8  # units of eps: sin π, in float32 as well, times what it is multiplied with
-GAIN = 64  # units of eps of Q max|V|: a smaller gain of leaving is rounding
+ROUNDINGS = 8  # units of eps: sin π, also in float32, times its factor
+GAIN = 64  # units of eps of Q max|V|: a smaller gain from leaving is rounding
 
 
 class Standstill(NamedTuple):
-    """The nodes where the system can rest, and the scales of cost and time that tell it.
+    """The nodes where the system can rest, and the scales of cost and time used to decide this.
 
     Attributes:
       rests: bool (*grid).
       least: the least running cost at every node, (*grid).
-      crossing: the time that the fastest motion takes from end to end of the box, all axes after one another; a number.
+      crossing: the time of the fastest motion through the box along all axes, one after the other; a number.
     """
 
     rests: Mask
@@ -42,45 +41,45 @@ class Standstill(NamedTuple):
 
 
 def standstill(on: Discretisation) -> Standstill:
-    """The nodes where the system can rest at no cost, up to rounding: sin π is not zero in floating point.
+    """The nodes where the system can rest at no cost, up to rounding, since sin π is not zero in floating point.
 
-    With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|: its minimum vanishes at rest alone.
+    With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|, which vanishes only at rest.
     """
     grid, dtype = on.grid, on.dtype
     least = _least_cost(on)
     speeds, dearest = _scales(on)
-    cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite where a constrained end leaves none
-    # the least cost may be zero everywhere: then the dearest action sets the scale, and without any cost one does
+    cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite if a constrained end admits no action
+    # if the least cost is zero everywhere, the most expensive action sets the scale; without any cost the scale is one
     cost = jnp.where(cost > 0, cost, jnp.where(dearest > 0, dearest, 1))
-    # an axis along which nothing moves puts no condition on rest
+    # an axis without motion imposes no condition
     speeds = jnp.where(speeds > 0, speeds, 1)
-    # s_i = max L/max|f_i| puts costs and all speeds into one unit, so that none drowns in the rounding of another
+    # s_i = max L/max|f_i| brings costs and speeds to one unit, so rounding in one does not hide another
     effort, u, d = optimum.optimise(discrete.at_rest(on, cost / speeds))
     small = ROUNDINGS * jnp.finfo(dtype).eps
-    # of the action that was found, not of all: the minimum is at rest where any action is
+    # checking the optimal action is enough: the minimum is at rest wherever any action is
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
     for axis, speed in enumerate(_noise_speeds(on, u, d)):
         rests &= speed <= small * speeds[axis]
-    # axes one after another: an upper bound, whichever way the motion turns
+    # axes one after another: an upper bound for any direction of motion
     extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in range(grid.ndim)])
     return Standstill(rests, least, jnp.sum(extents / speeds))
 
 
 def _least_cost(on: Discretisation) -> Field:
-    """The least running cost at every node, in a game that of both players' best actions, (*grid)."""
-    if not on.grid.sides("constrained"):  # else the drift tells which actions there are
+    """The least running cost at every node, in a game for both players' best actions, (*grid)."""
+    if not on.grid.sides("constrained"):  # otherwise the admissible actions depend on the drift
         on = on.asking(altered(on.problem, drift=_nowhere, noise=None))
-    # at V = 0 the Hamiltonian is L alone
+    # at V = 0 the Hamiltonian is L
     return optimum.optimise(discrete.around(on, jnp.zeros(on.grid.shape, on.dtype)))[0]
 
 
 def _nowhere(x: jax.Array, *actions: jax.Array) -> jax.Array:
-    """No drift."""
+    """Zero drift."""
     return jnp.zeros_like(x)
 
 
 def _noise_speeds(on: Discretisation, u: list, d: list) -> list[jax.Array]:
-    """a_ii/h_i along every axis: the speed at which noise leaves a node, correlated noise included."""
+    """a_ii/h_i along every axis: the speed at which noise leaves a node, including correlated noise."""
     a, none = on.diffusion(u, d), jnp.zeros((), on.dtype)
     return [a.get((axis, axis), none) / on.grid.spacing(axis) for axis in range(on.grid.ndim)]
 
@@ -101,7 +100,7 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
         return jnp.max(jnp.abs(jnp.broadcast_to(jnp.asarray(entry, dtype), grid.shape)))
 
     def look(found: tuple, pair: jax.Array) -> tuple:
-        # or XLA hoists what does not depend on the pair and keeps an array of all nodes for each of it
+        # otherwise XLA hoists terms that do not depend on the pair and keeps an array of all nodes for each
         x, (u, d) = jax.lax.optimization_barrier((on.coordinates(), (list(us[pair[0]]), list(ds[pair[1]]))))
         f, spread = on.drift(u, d, x), _noise_speeds(on, u, d)
         speeds = jnp.stack([largest(jnp.abs(drift) + noise) for drift, noise in zip(f, spread, strict=True)])
@@ -113,13 +112,13 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
 
 
 def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Mask, value: Field) -> jax.Array:
-    """The held rest nodes at which some action has L + Σ_o c_o (V(x + o) − V(x)) < 0, bool (*grid).
+    """The fixed rest nodes at which some action has L + Σ_o c_o (V(x + o) − V(x)) < 0, bool (*grid).
 
-    With none of them the value with held rest nodes solves the problem in which they may be left, too.
+    If there are none, the value with fixed rest nodes also solves the problem in which they may be left.
     """
-    # fixed nodes are targets, nodes out of reach and rest nodes; only of these the value is in doubt
+    # fixed nodes are targets, unreachable nodes and rest nodes; only for rest nodes the value is in doubt
     rests = obstacles.fixed & counted & ~jnp.asarray(obstacles.ended)
-    # not held for this look: the defect at a rest node is the gain of its best action
+    # not fixed in this evaluation: the defect at a rest node is the gain of its best action
     policy = bellman.greedy(on, value, obstacles.fixed & ~rests)
     u, d = list(policy.controls), list(policy.disturbances)
     leaving = jump_rates(on, u, d).total()
@@ -129,8 +128,8 @@ def leaving_pays(on: Discretisation, obstacles: Obstacles, counted: Mask, value:
 
 
 def release(obstacles: Obstacles, pays: Mask) -> Obstacles:
-    """The obstacles with the nodes ``pays`` no longer held: there the run may rest, V ≤ 0, or leave."""
-    # V ≤ 0 as a stopping cost of zero, which is what resting for ever amounts to
+    """The obstacles without the fixed nodes ``pays``, where the run may now rest, V ≤ 0, or leave."""
+    # V ≤ 0 as a stopping cost of zero, which is the value of resting indefinitely
     stop = jnp.where(pays, 0, jnp.inf)
     stop = stop if obstacles.upper is None else jnp.minimum(stop, obstacles.upper)
     return bellman.Obstacles(obstacles.fixed & ~pays, obstacles.fixed_value, stop, obstacles.lower, obstacles.ended)

@@ -1,14 +1,14 @@
-"""Where a Markov chain stays for ever, and how often it is where.
+"""Recurrent classes of a Markov chain and their stationary distributions.
 
-A recurrent class is a set of states that lead to one another and to nothing else; a finite chain has at least one, and
-a single stationary law μ exactly if it has one only. On that class, with μ_k = 1 at one of its states, the others solve
+A recurrent class is a set of states that lead to one another and nowhere else. A finite chain has at least one, and a
+unique stationary law μ exactly if it has only one. On that class, with μ_k = 1 at one state k, the other entries solve
 
     (−𝓛*) μ = (rates from k)        without the row and the column k,
 
-an M-matrix that is diagonally dominant by columns, so that elimination along the diagonal is stable and subtracts
-nothing. Rounding moves μ by at most eps (−𝓛*)⁻¹ |𝓛*| μ, entry by entry to first order, which one more solve
-tells. Where that is much, the class hangs together by rates that are hardly more than rounding: to the computer it is
-several. Cost: one or two sparse LU factorisations, as of a stationary solve on the same grid.
+an M-matrix that is diagonally dominant by columns, so elimination along the diagonal is stable and free of
+cancellation. Rounding changes μ by at most eps (−𝓛*)⁻¹ |𝓛*| μ, entry by entry to first order, which one more solve
+evaluates. If this is large, the class is connected by rates hardly larger than rounding, and numerically there are
+several classes. The cost is one or two sparse LU factorisations, as for a stationary solve on the same grid.
 """
 
 from typing import TYPE_CHECKING
@@ -18,14 +18,14 @@ import numpy as np
 if TYPE_CHECKING:
     from scipy.sparse import csc_array, csr_array
 
-ROUNDINGS = 8  # units of eps in an entry of the matrix: a rate is made of so many operations
-LARGEST_ERROR = 1e-6  # in total variation, of what rounding does to a law
-NEAR_PEAK = 1e3  # a law larger than this at another state than k is solved for again from there
-PASSES = 8  # changes of the pinned state, at most: each goes to the peak of the last law
+ROUNDINGS = 8  # units of eps in an entry of the matrix, from the number of operations that compute a rate
+LARGEST_ERROR = 1e-6  # largest error of a law by rounding, in total variation
+NEAR_PEAK = 1e3  # if the law exceeds this at another state than k, it is computed again with that state pinned
+PASSES = 8  # largest number of changes of the pinned state, each to the peak of the last law
 
 
 def classes(generator: "csr_array") -> list[np.ndarray]:
-    """The recurrent classes of a chain, each the numbers of its states; host level.
+    """The recurrent classes of a chain, each as the indices of its states; host level.
 
     Args:
       generator: a SciPy sparse array of shape (S, S), rates off the diagonal.
@@ -35,7 +35,7 @@ def classes(generator: "csr_array") -> list[np.ndarray]:
     # states that lead to one another are the strong components of the graph of jumps
     count, label = connected_components(generator, directed=True, connection="strong")
     entries = generator.tocoo()
-    # an entry that is stored although it is zero leads nowhere
+    # ignore entries that are stored but zero
     leads_out = (label[entries.row] != label[entries.col]) & (entries.data != 0)
     closed = np.ones(count, bool)
     closed[label[entries.row[leads_out]]] = False
@@ -43,24 +43,24 @@ def classes(generator: "csr_array") -> list[np.ndarray]:
 
 
 def law(generator: "csr_array", states: np.ndarray) -> tuple[np.ndarray, float]:
-    """The stationary probabilities of one recurrent class, and the bound on their error by rounding.
+    """The stationary probabilities of one recurrent class, with a bound on their rounding error.
 
     Args:
       generator: a SciPy sparse array of shape (S, S), per unit time; its rows sum to zero.
-      states: the numbers of the states of the class.
+      states: the indices of the states of the class.
 
     Returns:
-      Probabilities, shape (S,), and the bound on their error by rounding in total variation; inf if there is none.
+      Probabilities, shape (S,), and the bound on their rounding error in total variation; inf if there is none.
     """
     probabilities = np.zeros(generator.shape[0])
-    if len(states) == 1:  # absorbing: nothing to solve, and no rate to divide by
+    if len(states) == 1:  # an absorbing state: nothing to solve, and no rate to divide by
         probabilities[states] = 1.0
         return probabilities, 0.0
-    # −𝓛* on the class: columns sum to zero, since nothing leads out of it
+    # −𝓛* on the class: columns sum to zero, since nothing leaves the class
     outflow = -generator.tocsr()[states][:, states].T.tocsc()
     found, error = np.zeros(len(states)), np.inf
-    # a state in the middle of the box to begin with, which is seldom where the law vanishes: with μ_k = 1 at a state
-    # that is hardly ever visited the others overflow
+    # start with a state in the middle of the box, where the law seldom vanishes; with μ_k = 1 at a state that is hardly
+    # ever visited the other entries overflow
     pinned = len(states) // 2
     for _ in range(PASSES):
         found, error = _from(outflow, pinned)
@@ -71,12 +71,12 @@ def law(generator: "csr_array", states: np.ndarray) -> tuple[np.ndarray, float]:
     total = found.sum()
     if not (np.isfinite(total) and error < np.inf):
         return probabilities, np.inf
-    probabilities[states] = np.maximum(found, 0) / total  # no probability below zero, not even by rounding
+    probabilities[states] = np.maximum(found, 0) / total  # rounding must not make a probability negative
     return probabilities, error / total
 
 
 def _from(outflow: "csc_array", pinned: int) -> tuple[np.ndarray, float]:
-    """μ with μ = 1 at ``pinned``, and the bound on the sum of its errors by rounding."""
+    """μ with μ = 1 at ``pinned``, and the bound on the sum of its rounding errors."""
     from scipy.sparse.linalg import splu
 
     rest = np.delete(np.arange(outflow.shape[0]), pinned)
@@ -85,14 +85,14 @@ def _from(outflow: "csc_array", pinned: int) -> tuple[np.ndarray, float]:
     try:
         factors = splu(
             matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )  # no pivoting: what is eliminated along the diagonal is added up, not subtracted
+        )  # no pivoting: elimination along the diagonal only adds
     except RuntimeError:  # exactly singular
         return measure, np.inf
-    # over: the peak may be larger than what floats hold; ``law`` then pins it there
+    # the peak may exceed the range of floats; ``law`` then pins the peak
     with np.errstate(over="ignore", invalid="ignore"):
         measure[rest] = factors.solve(source)
         size = abs(matrix) @ np.abs(measure[rest]) + source
-        # the residual that rounding leaves is at most eps |𝓛*| μ, entry by entry; the inverse of an M-matrix is
-        # not negative, so that one solve with its size bounds what comes of it
+        # the residual left by rounding is at most eps |𝓛*| μ, entry by entry; the inverse of an M-matrix is
+        # non-negative, so one solve with this size as the right-hand side bounds the error
         error = np.abs(factors.solve(ROUNDINGS * np.finfo(np.float64).eps * size)).sum()
     return measure, float(error) if np.isfinite(error) else np.inf

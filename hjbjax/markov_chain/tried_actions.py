@@ -1,7 +1,7 @@
-"""The actions that are tried where it counts which jumps an action makes, and not what it costs.
+"""The actions to try when only the jumps of an action matter, not its cost.
 
-Samples of a set, and the actions between them at which a jump vanishes: a set of actions whose jumps all lead where
-they should may be thinner than the samples are dense.
+They are samples of the set, and the actions between them at which a jump vanishes: a set of actions whose jumps all
+lead to the right nodes may be thinner than the spacing of the samples.
 """
 
 import functools
@@ -19,15 +19,15 @@ from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.problem.types import Array, Mask
 from hjbjax.tracing import components
 
-COMBINATIONS = 32  # of kinks of all inputs that are tried with one action
-SAMPLES = 33  # actions of a continuum that are tried
+COMBINATIONS = 32  # largest number of combinations of kinks tried with one action
+SAMPLES = 33  # number of samples of a continuum
 
 
 def control_samples(problem: Problem) -> tuple[Array, int]:
-    """Actions of the control, shape (count, m), and the number of those to try first, which are often enough.
+    """Samples of the control, shape (count, m), and the number of those to try first, which often suffice.
 
-    In the first actions every input has its least, its middle or its greatest value. A problem without a control has
-    one action, without inputs.
+    In the first ones every input has its least, middle or greatest value. A problem without a control has one action
+    without inputs.
     """
     if problem.controls is None:
         return np.zeros((1, 0)), 1
@@ -38,30 +38,31 @@ def control_samples(problem: Problem) -> tuple[Array, int]:
 
 
 def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
-    """An action, and those with some inputs moved to where a component of the drift vanishes; each input (*grid).
+    """An action, and copies with some inputs moved to where a component of the drift vanishes; each input (*grid).
 
-    Only there may a jump stay away that all samples make. Where the drift is not affine in the inputs there are none,
-    and for one input they are the same whatever the action: see ``beside_samples``.
+    Only there may a jump vanish that all samples make. If the drift is not affine in the inputs there are none. For a
+    single input the kinks do not depend on the action; see ``beside_samples``.
     """
     found = [action]
     if not _knows_kinks(on, player) or len(player.driven) == 1:
         return found
     for j, driven in enumerate(player.driven):
-        # every input multiplies the count by one more than the components it drives: six inputs of one each make 64
+        # every input multiplies the count by one plus the number of components it drives: six inputs with one each give
+        # 64
         if len(found) * (1 + len(driven)) > COMBINATIONS:
             break
         for base in tuple(found):
             for kink in _kinks(on, player, base, j):
                 moved = [kink if k == j else entry for k, entry in enumerate(base)]
-                # a kink outside the set is no action: the sample itself stands in, which changes nothing
+                # a kink outside the set is replaced by the sample itself, which changes nothing
                 found.append(_where(_contains(player.admissible, moved), moved, base))
     return found
 
 
 def beside_samples(on: Discretisation, player: Player) -> list[list]:
-    """The actions that are tried once, in addition to all samples; each input (*grid).
+    """The actions to try once, in addition to all samples; each input (*grid).
 
-    For one input they make a component of the drift vanish; for a ball see ``_of_a_ball``.
+    A single input is set to where a component of the drift vanishes; for a ball see ``_of_a_ball``.
     """
     if not _knows_kinks(on, player):
         return []
@@ -74,29 +75,29 @@ def beside_samples(on: Discretisation, player: Player) -> list[list]:
 
 
 def _knows_kinks(on: Discretisation, player: Player) -> bool:
-    """True if the drift is affine in a control of a box or a ball, and no disturbance adds to it."""
+    """True if the drift is affine in a control of a box or a ball, without a disturbance."""
     return player.exact and not on.problem.is_game
 
 
 def _of_a_ball(on: Discretisation, ball: Ball, player: Player) -> list[list]:
     """The actions of a ball that go furthest along one input while others let their components vanish.
 
-    Each input u_j drives one component f_j of its own. Among the actions with given signs of all f_j, that with the
-    largest |f_k| has some inputs S at their kinks, f_S = 0, no others, and all the room they leave in u_k.
+    Each input u_j drives its own component f_j. Among the actions with given signs of all f_j, the action with the
+    largest |f_k| has some inputs S at their kinks, f_S = 0, the other inputs zero, and the remaining radius in u_k.
     """
     none, radius = [jnp.zeros((), on.dtype)] * ball.dim, ball.radius
-    # inputs of a ball drive at most one component each, so that a kink does not depend on the other inputs
+    # inputs of a ball drive at most one component each, so a kink does not depend on the other inputs
     kinks = [_kinks(on, player, none, j) or [none[j]] for j in range(len(none))]
     found: list[list] = []
     for count in range(len(none)):
         if len(found) >= COMBINATIONS:
             break
         for still in itertools.combinations(range(len(none)), count):
-            # what the inputs at their kinks leave of |u|² ≤ r² for the one that goes furthest
+            # the remainder of |u|² ≤ r² for the input that goes furthest
             room = radius**2 - sum((kinks[j][0] ** 2 for j in still), start=none[0])
             for k, way in itertools.product(sorted(set(range(len(none))) - set(still)), (-1, 1)):
                 action = [kinks[j][0] if j in still else entry for j, entry in enumerate(none)]
-                # at nodes without such an action the room is negative, and its root NaN
+                # at nodes without such an action the room is negative, and its root would be NaN
                 action[k] = way * jnp.sqrt(jnp.maximum(room, 0))
                 found.append(_where(room >= 0, action, none))
     return found
@@ -105,7 +106,7 @@ def _of_a_ball(on: Discretisation, ball: Ball, player: Player) -> list[list]:
 def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list[jax.Array]:
     """The values of input j, each (*grid), at which a component that it drives vanishes, given the other inputs.
 
-    Its own place where they never do.
+    The current value of the input where no component vanishes.
     """
     problem = on.problem
     # f_i is affine in u_j: f_i = offset_i + slope_i u_j vanishes at −offset_i/slope_i
@@ -114,22 +115,22 @@ def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list[jax.A
     arguments = problem.arguments(on.coordinates(), at_zero, None, 0.0)
     slope = components.components(player.derivative(problem, problem.drift, j), *arguments, dtype=on.dtype)
     return [
-        # a slope may vanish at some nodes: divided by one there, and not used
+        # where a slope vanishes, divide by one and discard the result
         jnp.where(slope[i] != 0, -offset[i] / jnp.where(slope[i] != 0, slope[i], 1), base[j])
         for i in player.driven[j]
     ]
 
 
 def _where(condition: Mask, action: list, otherwise: list) -> list[jax.Array]:
-    """One action or another, node by node."""
+    """Select one of two actions at each node."""
     return [jnp.where(condition, new, old) for new, old in zip(action, otherwise, strict=True)]
 
 
 def _contains(admissible: AdmissibleSet | None, action: list) -> Mask:
-    """The nodes at which an action lies in its box or ball."""
+    """The nodes at which an action is in its box or ball."""
     if isinstance(admissible, Ball):
         return sum(u * u for u in action) <= admissible.radius**2
-    assert isinstance(admissible, Box)  # kinks are asked for where the minimum is exact: of no other set
+    assert isinstance(admissible, Box)  # kinks are used only for exact minima, over a box or a ball
     return functools.reduce(
         jnp.logical_and, ((u >= admissible.lo[j]) & (u <= admissible.hi[j]) for j, u in enumerate(action))
     )

@@ -1,7 +1,7 @@
-"""The answer, and how a run may end: solution, status, clock; on the screen, in files, and between the nodes.
+"""Solutions, and the ways in which a run may end.
 
-Read ``solution`` and ``status`` first. ``clock`` holds the limits of a run and Ctrl-C, ``interpolation`` values between
-nodes, ``nested_grids`` carries them from one grid to another, and ``grid_error`` estimates the error from two grids.
-``screen`` what is printed, ``files`` the format and ``placement`` how a file gets to its place. ``checkpoints`` keeps
-what a run had done when it was cut.
+Read ``solution`` and ``status`` first. ``clock`` has the limits of a run and handles Ctrl-C. ``interpolation``
+evaluates values between nodes, ``nested_grids`` transfers them from one grid to another, and ``grid_error`` estimates
+the error from two grids. ``screen`` formats what is printed, ``files`` defines the file format, and ``placement`` moves
+a file to its path. ``checkpoints`` stores the state of an interrupted run.
 """

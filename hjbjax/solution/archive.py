@@ -1,4 +1,4 @@
-"""A solution as a header and arrays, and back, for result files; and as arrays with names, for other tools."""
+"""Conversion of a solution to a header and arrays for result files, and to named arrays for other tools."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +11,11 @@ from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.files import Expected, FileError
 from hjbjax.solution.status import Status
 
-if TYPE_CHECKING:  # an extra, imported when it is needed
+if TYPE_CHECKING:  # an optional dependency, imported on use
     import xarray
 
-FORMAT, VERSION = "hjbjax.Solution", 1  # the version goes up when an older hjbjax would read a file wrongly
-KINDS: dict[str, tuple[type, ...]] = {  # what a file's header holds, as JSON has it
+FORMAT, VERSION = "hjbjax.Solution", 1  # the version is incremented when an older hjbjax would misread a file
+KINDS: dict[str, tuple[type, ...]] = {  # types in the header of a file, as JSON returns them
     "code": (int,),
     "steps": (int,),
     "isaacs_gap": (float, type(None)),
@@ -31,7 +31,7 @@ def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a solution.
 
     Raises:
-      ValueError: arrays that do not fit the grid, as of a batch.
+      ValueError: the arrays do not fit the grid, for example the arrays of a batch.
     """
     grid = solution.grid
     header = {
@@ -56,20 +56,20 @@ def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     arrays = {}
     for name, wanted in plan(header).items():
         array = getattr(grid if name in ("lo", "hi") else solution, name)
-        if array is None:  # what may be missing is optional in the plan, and comes back as None
+        if array is None:  # optional arrays that are missing come back as None
             continue
         arrays[name] = array = np.asarray(array)
         if complaint := wanted.complaint(array.shape, array.dtype.str):
-            raise ValueError(f"Solution.save: {name} {complaint}; of a batch, save one solution at a time")
+            raise ValueError(f"Solution.save: {name} {complaint}; save the solutions of a batch one at a time")
     return header, arrays
 
 
 def plan(header: dict) -> dict[str, Expected]:
-    """Shapes and dtypes of the arrays in a file, from the grid in its header alone."""
+    """Shapes and dtypes of the arrays in a file; they follow from the grid in its header."""
     shape, marched = tuple(header["grid"]["shape"]), header["marched"]
-    if not all(type(count) is int and count >= 2 for count in shape):  # before sizes are made of them
+    if not all(type(count) is int and count >= 2 for count in shape):  # before computing array sizes
         raise FileError(f"its grid has shape {shape}")
-    # number of inputs, residuals: any; of a marched solution the kept times go first
+    # None: any number of inputs or residuals; the kept times of a marched solution are the leading axis
     many, lead = (None,), () if marched is None else (marched,)
     controls = Expected((lead + shape + many, many * len(lead) + shape + many))
     return {
@@ -89,26 +89,26 @@ def plan(header: dict) -> dict[str, Expected]:
 
 
 def fields(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The arguments of ``Solution`` from the header and the arrays of a file; ``Grid`` checks its own."""
+    """The arguments of ``Solution`` from the header and the arrays of a file; ``Grid`` checks its own arguments."""
     about = header["grid"]
     stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
     grid = Grid(
         arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
-        about.get("edges", "projected"),  # older files have none, as all ends were projected
-        tuple(about.get("units", ())),  # nor these, nor labels
+        about.get("edges", "projected"),  # missing in older files, in which all ends are projected
+        tuple(about.get("units", ())),  # missing in older files, like the labels
     )  # fmt: skip
     names, units, inside = header.get("labels", Labels())
     labels = labelling.checked(names, units, inside, None)
-    header = {"monotone_error": None, **header}  # older files have none
-    for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``: true is no number of steps
+    header = {"monotone_error": None, **header}  # missing in older files
+    for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``, because True is not a number of steps
         if type(header[name]) not in kinds:
             raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
-    Status(header["code"])  # raises where there is no such status
+    Status(header["code"])  # raises if there is no such status
     return {"policy": None, **arrays, "grid": grid, "labels": labels, **{name: header[name] for name in KINDS}}
 
 
 def dataset(solution: Any) -> "xarray.Dataset":
-    """A solution as arrays with the names and units of its states and controls.
+    """A solution as an xarray dataset with the names and units of its states and controls.
 
     Raises:
       ImportError: xarray is not installed.
@@ -147,7 +147,7 @@ def dataset(solution: Any) -> "xarray.Dataset":
 def netcdf(found: "xarray.Dataset") -> bytes:
     """A dataset as the bytes of a netCDF file.
 
-    A slash in a name, which means a path of groups in netCDF, is written as the fraction slash, ⁄.
+    A slash in a name would mean a path of groups in netCDF; it is written as the fraction slash, ⁄.
 
     Raises:
       ImportError: h5netcdf is not installed.
@@ -159,18 +159,18 @@ def netcdf(found: "xarray.Dataset") -> bytes:
     except ImportError:
         raise ImportError("Solution.to_netcdf needs h5netcdf: pip install 'hjbjax[io]'") from None
     found = found.rename({name: name.replace("/", "⁄") for name in map(str, found.variables) if "/" in name})
-    # HDF5 ends the process if it cannot close a file, as on a full disk: so it writes into memory, where it always can.
-    # netCDF's own library wants the order of attributes tracked.
+    # HDF5 ends the process if it cannot close a file, for example on a full disk. It therefore writes into memory,
+    # where closing never fails. netCDF's own library requires tracked attribute order.
     with h5py.File("memory", "w", driver="core", backing_store=False, track_order=True) as image:
         with h5netcdf.File(image, "w") as file:
-            # without xarray's lock, which Ctrl-C may leave locked for good: nobody else knows this file
+            # without xarray's lock, which Ctrl-C may leave locked; no other thread uses this file
             found.dump_to_store(H5NetCDFStore(file, lock=False))
         image.flush()
         return image.id.get_file_image()
 
 
 def _input(labels: Labels, kind: str, j: int, count: int) -> tuple[str, str]:
-    """Name and unit of a control or of a disturbance."""
+    """Name and unit of a control or a disturbance."""
     if kind == "disturbance":
         return ("d" if count == 1 else f"d{j + 1}"), ""
     unit = labels.control_units[j] if j < len(labels.control_units) else ""

@@ -1,12 +1,11 @@
-"""Checkpoints: the state of a run in a file, from which a later run goes on to the same bits.
+"""Checkpoints: the state of a run in a file, from which a later run continues with the same bits.
 
-A run is a sequence of parts, each a computation in steps whose state holds everything it needs: coarser grids, the path
-to a guess, the monotone solve, the one of second order. Whatever happens between two parts is computed again, with the
-same result on the same machine with the same versions; so a file holds only the states of the parts that are done and
-of the one under way. Files are written whole or not at all: whenever a run is killed, its file is the old one or the
-new one.
+A run is a sequence of parts, each a computation in steps with a complete state: coarser grids, the computation of a
+guess, the monotone solve, the second-order solve. Everything between two parts is computed again, with the same result
+on the same machine with the same versions. A file therefore stores only the states of the completed parts and of the
+current one. Files are written atomically: if a run is killed, its file is either the old one or the new one.
 
-A run makes its file before it computes anything, which tries the place, and holds it locked until its end.
+A run creates its file before it computes anything, which also tests the path, and keeps it locked until its end.
 """
 
 import contextlib
@@ -36,13 +35,13 @@ from hjbjax.tracing.outside import ADDRESS
 FORMAT, VERSION = "hjbjax.Checkpoint", 1
 SECONDS = 60.0  # between two writes
 KINDS = tuple(map(np.dtype, ("f8", "f4", "i8", "i4", "u4", "u1", "?")))  # of the arrays in a state
-# the ends of a part that is not done: a later run goes on from there
+# the statuses of an incomplete part, from which a later run continues
 CUT_SHORT = (Status.INTERRUPTED, Status.TIME_LIMIT, Status.MAX_STEPS, Status.RUNNING)
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The file that keeps the state of a run, and how often it is written.
+    """The file for the state of a run, and the interval between writes.
 
     Args:
       path: the file; ``.npz`` is added to a name without a suffix.
@@ -64,7 +63,7 @@ class Checkpoint:
 
 
 class Part(Protocol):
-    """A computation in steps, as a checkpoint sees it."""
+    """A computation in steps, as used by a checkpoint."""
 
     @property
     def passing(self) -> bool:
@@ -74,7 +73,7 @@ class Part(Protocol):
         """Its state, as a list of arrays."""
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from the arrays of ``saved``.
+        """Continue from the arrays of ``saved``.
 
         Raises:
           ValueError: the arrays are not a state of this part.
@@ -83,9 +82,9 @@ class Part(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """The state of a part, and how it ended.
+    """The state of a part, and its status.
 
-    A part that only led to a guess keeps no arrays once the next part has begun.
+    A part that only computes a guess keeps no arrays once the next part has begun.
     """
 
     arrays: Sequence[np.ndarray]
@@ -94,29 +93,29 @@ class Record:
 
     @property
     def done(self) -> bool:
-        """True if no step is left to be taken."""
-        # the path to a guess is given a number of steps, and ends with them
+        """True if no steps remain."""
+        # the computation of a guess has a fixed number of steps, and ends with them
         return self.status not in CUT_SHORT or (self.passing and self.status is Status.MAX_STEPS)
 
 
 class Journal:
-    """The parts of a run: those that are done, and the one under way.
+    """The parts of a run: the completed parts and the current one.
 
     Args:
-      file: the file that holds them, maybe with those of other lanes.
-      records: those of an earlier run.
+      file: the file with this journal, and maybe those for other lanes.
+      records: the records of an earlier run.
     """
 
     def __init__(self, file: "File", records: Sequence[Record] = ()):
         self.file, self.records = file, list(records)
-        self._at = 0  # the part under way, or the one that comes next
+        self._at = 0  # the index of the current part, or of the next one
         self._closed = False
 
     def enter(self, part: Part) -> Status | None:
-        """Bring a part to its recorded state; its status if it is done, otherwise None.
+        """Bring a part to its recorded state, and return its status if it is complete, otherwise None.
 
         Raises:
-          FileError: the record is not one of this part.
+          FileError: the record belongs to another part.
         """
         if self._closed or self._at >= len(self.records):
             return None
@@ -131,13 +130,13 @@ class Journal:
         return record.status if record.done else None
 
     def keep(self, part: Part) -> None:
-        """Write the state of the part under way, if it is time for that."""
+        """Write the state of the current part, if a write is due."""
         if not self._closed and self.file.is_due():
             self._note(part, Status.RUNNING)
             self.file.write()
 
     def leave(self, part: Part, status: Status) -> None:
-        """Record the end of a part, or how far it came; after a cut nothing else is recorded."""
+        """Record the end of a part, or its progress; after a cut nothing else is recorded."""
         if self._closed:
             return
         self._note(part, status)
@@ -145,9 +144,9 @@ class Journal:
         self._at, self._closed = self._at + done, not done
 
     def _note(self, part: Part, status: Status) -> None:
-        """Record the state of the part under way, and forget the states that led to where it began."""
+        """Record the state of the current part, and drop the states that only led to its start."""
         before = [dataclasses.replace(each, arrays=()) if each.passing else each for each in self.records[: self._at]]
-        # copied before a next step: a view of JAX's array keeps that step from reusing the array's memory
+        # copied before the next step: a view of JAX's array would keep that step from reusing the array's memory
         keep = np.array if status is Status.RUNNING else np.asarray
         arrays = [keep(array) for array in jax.device_get(part.saved())]
         self.records = [*before, Record(arrays, status, part.passing)]
@@ -159,11 +158,11 @@ class File:
 
     Args:
       checkpoint: the path and the seconds between two writes.
-      question: the question as digests and words; see ``describe_question``.
+      question: the problem as digests and words; see ``describe_question``.
       known: the records of an earlier run, by the names of their journals.
-      target: the file; None in a process that leaves the writing to another one.
+      target: the file; None in a process that does not write.
       caller: the function that was called, for messages.
-      together: True if many processes solve one problem.
+      together: True if several processes solve one problem.
     """
 
     def __init__(
@@ -181,11 +180,11 @@ class File:
         self.journals: dict[str, Journal] = {}
         self.changed = False
         self.failure: str | None = None  # why it could not be written
-        self._written, self._lock = time.monotonic(), threading.Lock()  # lanes write from threads of their own
+        self._written, self._lock = time.monotonic(), threading.Lock()  # lanes write from separate threads
 
     @property
     def outcome(self) -> str:
-        """The word for the end of the run: "written", or why not."""
+        """The outcome of the writes: "written", or the reason for a failure."""
         return self.failure or "written"
 
     def journal(self, name: str = "run") -> Journal:
@@ -193,18 +192,18 @@ class File:
         return self.journals.setdefault(name, Journal(self, self.known.get(name, ())))
 
     def is_due(self) -> bool:
-        """True if it is time to write."""
+        """True if a write is due."""
         due = time.monotonic() - self._written >= self.checkpoint.every
-        # the state is gathered from all processes, so all of them have to agree
+        # the state is gathered from all processes, so they must agree
         return bool(agreed(int(due))) if self.together else due
 
     def records(self) -> dict[str, Sequence[Record]]:
-        """All records by the names of their journals, with those of lanes that have not begun yet."""
-        begun = {name: each.records for name, each in dict(self.journals).items()}  # copied: lanes begin meanwhile
+        """All records by the names of their journals, including lanes that have not begun."""
+        begun = {name: each.records for name, each in dict(self.journals).items()}  # copied: lanes may begin meanwhile
         return {**self.known, **begun}
 
     def write(self) -> None:
-        """Write what has changed; if that fails the run goes on, with one warning."""
+        """Write the changes; if that fails the run continues, with one warning."""
         with self._lock:
             if not self.changed or self.target is None:
                 return
@@ -220,12 +219,12 @@ class File:
             self._written = time.monotonic()
 
     def refusal(self, reason: str) -> FileError:
-        """The refusal of what the file holds."""
+        """The error for an unusable file."""
         return FileError(f"{self.caller}: {self.checkpoint.path!s}: cannot be read: {reason}")
 
 
 def check_alike(arrays: Sequence[np.ndarray], wanted: Sequence[Any]) -> None:
-    """Compare number, shapes and dtypes of arrays with those of others.
+    """Compare number, shapes and dtypes of arrays with the wanted ones.
 
     Raises:
       ValueError: they differ.
@@ -254,7 +253,7 @@ def _archive(question: Mapping[str, str], records: Mapping[str, Sequence[Record]
 
 
 def _arrays(records: Mapping[str, Sequence[Record]]) -> Iterator[tuple[str, np.ndarray]]:
-    """All arrays with the names that they have in a file."""
+    """All arrays with their names in the file."""
     for journal, some in records.items():
         for i, each in enumerate(some):
             for j, array in enumerate(each.arrays):
@@ -267,7 +266,7 @@ def _name(journal: str, part: int, array: int) -> str:
 
 
 def versions() -> dict[str, str]:
-    """The versions and the device on which the last bits of an answer depend."""
+    """The versions and the device that affect the last bits of a solution."""
     return {"hjbjax": __version__, "jax": jax.__version__, "device": str(jax.devices()[0].device_kind)}
 
 
@@ -284,26 +283,26 @@ def open_checkpoint(
 ) -> Iterator[File | None]:
     """Context with the file of a run, which is written at its end; None without a checkpoint.
 
-    The file is locked for the whole run. A new one is made at once; if the run ends with an exception before it has
-    anything to keep, the file is removed again.
+    The file is locked during the whole run. A new file is created at once, and removed if the run ends with an
+    exception before there is anything to store.
 
     Args:
       checkpoint: the file, or a ``Checkpoint``.
-      problems: one problem, or those of all lanes.
-      grid: the nodes.
-      resume: go on from the file, if there is one.
+      problems: one problem, or the problems of all lanes.
+      grid: the grid.
+      resume: continue from the file, if it exists.
       caller: the function that was called, for messages.
-      together: True if many processes solve the problem.
-      others: the other arguments that decide the answer.
+      together: True if several processes solve the problem.
+      others: the other arguments that affect the solution.
 
     Raises:
       ValueError: ``resume`` without a checkpoint.
       FileExistsError: the file exists, and ``resume`` is false.
-      FileError: the file cannot be read or written, belongs to another question, or another run is using it.
+      FileError: the file cannot be read or written, belongs to another problem, or is in use by another run.
     """
     if checkpoint is None:
         if resume:
-            raise ValueError(f"{caller}: resume=True goes on from a checkpoint; give checkpoint=, the file")
+            raise ValueError(f"{caller}: resume=True continues from a checkpoint; pass checkpoint=, the file")
         yield None
         return
     with _named_after(caller):
@@ -328,7 +327,7 @@ def open_checkpoint(
 
 @contextlib.contextmanager
 def _named_after(caller: str) -> Iterator[None]:
-    """Context in which refusals of files begin with the function that was called."""
+    """Context in which errors about files are prefixed with the function that was called."""
     try:
         yield
     except (FileError, FileExistsError) as error:
@@ -336,11 +335,11 @@ def _named_after(caller: str) -> Iterator[None]:
 
 
 def _begin(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> dict[str, list[Record]]:
-    """The records of an earlier run, from the file that is locked from now on; a new one holds none.
+    """The records of an earlier run, from the file, which is locked from now on; a new file has no records.
 
     Raises:
       FileExistsError: the file exists, and ``resume`` is false.
-      FileError: it is in use, or made for another question, or no file can be written there.
+      FileError: the file is in use or was made for another problem, or no file can be written there.
     """
     empty = _archive(question, {})
     if not resume:
@@ -348,11 +347,11 @@ def _begin(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> 
             target.write(empty)
         except FileExistsError:
             raise FileExistsError(
-                f"{target.path}: there is a checkpoint already; resume=True goes on from it"
+                f"{target.path}: there is a checkpoint already; pass resume=True to continue from it"
             ) from None
         return {}
     while not target.take():
-        with contextlib.suppress(FileExistsError):  # another run was faster, and ``take`` reports that
+        with contextlib.suppress(FileExistsError):  # another run was faster, which ``take`` reports
             target.write(empty)
             return {}
     placement.try_place(target.path)
@@ -360,7 +359,7 @@ def _begin(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> 
 
 
 def _begin_together(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> dict[str, list[Record]]:
-    """The same in each of many processes that solve one problem: the first one locks the file, the others read it."""
+    """``_begin`` in several processes that solve one problem: the first one locks the file, the others read it."""
     first, known = jax.process_index() == 0, {}
     with _in_all_processes(target.path):
         known = _begin(target, question, resume=resume) if first else {}
@@ -370,7 +369,7 @@ def _begin_together(target: LockedFile, question: Mapping[str, str], *, resume: 
 
 @contextlib.contextmanager
 def _in_all_processes(path: str) -> Iterator[None]:
-    """Context that all processes leave together; an exception in one of them is one in all, and nobody waits."""
+    """Context that all processes leave together: an exception in one of them raises in all, so no process waits."""
     try:
         yield
     except Exception:
@@ -381,7 +380,7 @@ def _in_all_processes(path: str) -> Iterator[None]:
 
 
 def describe_question(problems: Sequence[Problem], grid: Grid, **others: Any) -> dict[str, str]:
-    """The question of a run in digests and words: problems with settled functions, the grid, and other arguments."""
+    """The problem in digests and words: problems with settled functions, the grid, and other arguments."""
     about = (
         grid.shape,
         grid.periodic,
@@ -402,7 +401,7 @@ def describe_question(problems: Sequence[Problem], grid: Grid, **others: Any) ->
 
 
 def _read(path: str, question: Mapping[str, str]) -> dict[str, list[Record]]:
-    """The records in a file by the names of their journals; the file must have been made for the same question."""
+    """The records in a file by the names of their journals; the file must have been made for the same problem."""
 
     def rebuild(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, list[Record]]:
         made_for = header["asked"]
@@ -422,7 +421,7 @@ def _read(path: str, question: Mapping[str, str]) -> dict[str, list[Record]]:
 
 
 def _plan(header: dict) -> dict[str, Expected]:
-    """Shapes and dtypes of the arrays in a file, as its header has them."""
+    """Shapes and dtypes of the arrays in a file, from its header."""
     return {
         _name(name, i, j): Expected(
             (tuple(map(int, shape)),), tuple(kind for kind in KINDS if kind.str == code), optional=False

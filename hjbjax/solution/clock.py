@@ -1,12 +1,12 @@
-"""The limits of a long run: its seconds, its steps, and Ctrl-C; and how far it came.
+"""The limits of a long run: time, steps and Ctrl-C; and its progress.
 
-All that runs long does so in phases (checks, a survey of the nodes, preparation, grids, chunks of steps) and looks at
-its clock between two of them. Ctrl-C leaves a note on the clock instead of an exception: an exception may be thrown
-into a callback of the runtime and be swallowed there, and would take along what was done so far. What cannot be cut,
-a compilation or one step, is seen to its end, and nothing follows it.
+Long computations run in phases (checks, a survey of the nodes, preparation, grids, chunks of steps) and check their
+clock between two phases. Ctrl-C sets a flag on the clock instead of raising an exception, which might be swallowed in a
+callback of the runtime, and would lose the results so far. A compilation or a single step cannot be interrupted; it
+finishes, and nothing follows it.
 
-Where one problem is solved by many processes together, all do the same things in the same order, or they would wait for
-each other for ever: each limit that one of them meets is met by all, at the same look at the clock.
+If several processes solve one problem together, all must do the same in the same order, otherwise they would wait for
+each other indefinitely. A limit that one of them reaches therefore applies to all, at the same check of the clock.
 """
 
 import contextlib
@@ -23,15 +23,15 @@ import numpy as np
 from hjbjax.solution.status import Status
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-CHUNK_SECONDS = 0.5  # between two looks at the clock, where steps are short: how long Ctrl-C may take to be heard
+CHUNK_SECONDS = 0.5  # between two checks of the clock if steps are short, and so the delay of Ctrl-C
 REPEAT = 1.0  # seconds within which SIGTERM is sent twice: by a service manager to all processes, and by their launcher
 CUT = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 
 class Stopped(Exception):
-    """A run is over between two of its phases: ``status`` says why, ``reached`` is the answer so far, if there is one.
+    """A run ends between two of its phases: ``status`` is the reason, ``reached`` the solution so far, if any.
 
-    Caught where there is something to hand back.
+    Caught where there is a result to return.
     """
 
     def __init__(self, status: Status, reached: Any = None):
@@ -40,11 +40,11 @@ class Stopped(Exception):
 
 
 class Clock:
-    """The limits of a run, the time it has taken, that of its steps apart, and whether it was interrupted.
+    """The limits of a run, its elapsed time, the time of its steps, and a flag for interrupts.
 
-    ``phase`` says how far it came, as in "the survey of the nodes"; ``tell``, if there is one, is called with each new
-    one. ``per_node`` is the seconds that a step took at a node in the last chunk, from grid to grid; None before the
-    first. ``journal`` is what keeps the parts that are done in a file, or None. ``together`` is true in one of many
+    ``phase`` describes the progress, such as "the survey of the nodes"; ``tell``, if set, is called with each new
+    phase. ``per_node`` is the time per step and node in the last chunk, in seconds, also across grids; None before the
+    first chunk. ``journal`` stores the completed parts in a file, or is None. ``together`` is True in each of several
     processes that solve one problem.
     """
 
@@ -66,7 +66,7 @@ class Clock:
 
     @property
     def phase(self) -> str:
-        """How far the run came."""
+        """The current phase of the run."""
         return self._phase
 
     @phase.setter
@@ -80,51 +80,51 @@ class Clock:
         return time.perf_counter() - self.began
 
     def beside(self) -> "Clock":
-        """A clock for one of several runs side by side: with its own pace, and with one interrupt for all."""
+        """A clock for one of several parallel runs, with its own pace and a common interrupt."""
         return _Beside(self)
 
     def over(self) -> Status | None:
-        """INTERRUPTED or TIME_LIMIT; ``None`` to go on."""
-        # first: who pressed Ctrl-C wants to read that, whatever the time is
+        """INTERRUPTED or TIME_LIMIT; ``None`` to continue."""
+        # Ctrl-C takes precedence over the time limit
         found = 0 if self.interrupted else 1 if self.elapsed() >= self.seconds else 2
         return (Status.INTERRUPTED, Status.TIME_LIMIT, None)[self.least_of_all(found)]
 
     def least_of_all(self, number: int) -> int:
-        """The least of a number of every process, by which they agree; the number itself where there is one."""
+        """The least of this number over all processes, so that they agree; the number itself for a single process."""
         return agreed(number) if self.together else number
 
     def look(self) -> None:
-        """Go on, or raise ``Stopped``."""
+        """Return, or raise ``Stopped`` if the run is over."""
         code = self.over()
         if code is not None:
             raise Stopped(code)
 
     def enter(self, phase: str) -> None:
-        """Go on to the next phase, or raise ``Stopped``; the clock then keeps the phase before."""
+        """Begin the next phase, or raise ``Stopped`` and keep the previous phase."""
         self.look()
         self.phase = phase
 
     def count(self, seconds: float, steps: int, nodes: int) -> None:
-        """Take note of a chunk of steps."""
+        """Record the time of a chunk of steps."""
         self.stepping += seconds
-        # a chunk shorter than the clock can tell must not promise that a million steps take no time
+        # at least 1e-4 s, so that a chunk below the resolution of the clock does not predict steps without duration
         self.per_node = max(seconds, 1e-4) / (steps * nodes)
 
     def steps_in(self, seconds: float, nodes: int) -> float:
-        """The number of steps that take so long, by the last chunk."""
+        """The number of steps that fit into this time, at the pace of the last chunk."""
         assert self.per_node is not None
         return seconds / (self.per_node * nodes)
 
 
 def agreed(number: int) -> int:
-    """The least of a whole number over all processes of ``jax.distributed``, each of which has to ask."""
+    """The least of an integer over all processes of ``jax.distributed``, each of which must call this."""
     from jax.experimental import multihost_utils
 
     return int(np.min(multihost_utils.process_allgather(np.asarray(number, np.int32))))
 
 
 class _Beside(Clock):
-    """The clock of one of several runs side by side, with its own pace; interrupts and limits are those of all."""
+    """The clock of one of several parallel runs, with its own pace and common interrupts and limits."""
 
     def __init__(self, outer: Clock):
         self.__dict__["_outer"] = outer
@@ -132,7 +132,7 @@ class _Beside(Clock):
         self.began, self.phase = outer.began, outer.phase
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # an interrupt is never taken back by a lane that begins
+        # a lane that begins must not reset an interrupt
         if name == "interrupted":
             self._outer.interrupted |= value
         elif name == "seconds":
@@ -144,13 +144,13 @@ class _Beside(Clock):
         return getattr(self._outer, name)
 
 
-_running: list[Clock] = []  # of the main thread, the outermost run first
+_running: list[Clock] = []  # clocks of the main thread, the outermost run first
 _raised: list[int] = []  # signals for which ``_interrupt`` raised
-_heard: dict[int, float] = {}  # when a signal came for the last time
+_heard: dict[int, float] = {}  # time of the last occurrence of each signal
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """What the command does on a signal: Ctrl-C's exception, and a note that there was one."""
+    """Handle a signal in a command: record it and raise the exception of Ctrl-C."""
     now, before = time.monotonic(), _heard.get(number, -math.inf)
     _heard[number] = now
     if number == signal.SIGTERM and now - before < REPEAT:
@@ -161,14 +161,14 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Context of a command that Ctrl-C and SIGTERM end alike: a run in it keeps what it has for either.
+    """Context of a command that Ctrl-C and SIGTERM end in the same way: a run in it saves its results for both.
 
-    A second Ctrl-C cuts it short. SIGTERM within ``REPEAT`` seconds of another one does not.
+    A second Ctrl-C interrupts it at once. SIGTERM within ``REPEAT`` seconds of another SIGTERM does not.
 
-    Python drops an exception in a callback of its garbage collector, and JAX has such; the next run notes the signal.
-    A shell starts background jobs with SIGINT ignored, which stays so, and SIGTERM must not go by way of it.
+    Python drops exceptions in callbacks of its garbage collector, which JAX uses; the next run then checks the recorded
+    signal. A shell starts background jobs with SIGINT ignored. This is preserved, and SIGTERM has its own handler.
     """
-    if threading.current_thread() is not threading.main_thread():  # signals are another's business
+    if threading.current_thread() is not threading.main_thread():  # only the main thread handles signals
         yield
         return
     ignored = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
@@ -185,15 +185,15 @@ def interruptible() -> Iterator[None]:
 
 @contextlib.contextmanager
 def noting_interrupts(clock: Clock) -> Iterator[None]:
-    """Context in which Ctrl-C leaves a note on the clock, and on those of the runs around this one.
+    """Context in which Ctrl-C sets a flag on the clock, and on the clocks of the enclosing runs.
 
-    A second Ctrl-C is the usual exception. Only in the main thread, and not over a handler of the user's own. SIGTERM
-    likewise where it was made to do what Ctrl-C does: ``signal.signal(signal.SIGTERM, signal.default_int_handler)``.
+    A second Ctrl-C raises the usual exception. Only in the main thread, and only without a custom handler. SIGTERM is
+    treated in the same way after ``signal.signal(signal.SIGTERM, signal.default_int_handler)``.
     """
-    if threading.current_thread() is not threading.main_thread():  # Python hands signals to the main thread alone
+    if threading.current_thread() is not threading.main_thread():  # Python delivers signals to the main thread only
         yield
         return
-    # A run inside another one finds the handler of the outer already there.
+    # in a nested run the handler of the outer run is already installed
     handlers = {} if _running else {number: signal.getsignal(number) for number in SIGNALS}
     noted = {n: usual for n, usual in handlers.items() if usual in (signal.default_int_handler, _interrupt)}
 
@@ -205,9 +205,9 @@ def noting_interrupts(clock: Clock) -> Iterator[None]:
         _heard[number] = time.monotonic()
         for each in _running:
             each.interrupted = True
-        give_back()  # a second Ctrl-C is the usual KeyboardInterrupt
+        give_back()  # a second Ctrl-C raises the usual KeyboardInterrupt
 
-    # a Ctrl-C that fell between two inner runs was noted on the outer clock
+    # a Ctrl-C between two inner runs has set the flag of the outer clock
     clock.interrupted |= any(each.interrupted for each in _running) or bool(_raised)
     _running.append(clock)
     try:

@@ -1,10 +1,10 @@
-"""Result files: npz archives written whole or not at all, and read with suspicion.
+"""Result files: npz archives that are written atomically and validated when read.
 
-A file is an uncompressed zip of npy arrays, one of which, ``header``, is JSON in UTF-8. Writing goes to a temporary
-file in the same folder, then flush, fsync and the move of ``placement``: after a crash at any time the file is the old
-one or the new one. What a killed writer left behind is removed by the next writer in that folder. Reading never
-unpickles, and believes no declared size that exceeds the file's own size, so that a claim of 8 TB costs nothing.
-Every failure is one ``FileError``.
+A file is an uncompressed zip of npy arrays, one of which, ``header``, is JSON in UTF-8. Data is written to a temporary
+file in the same folder, flushed, synced and moved by ``placement``: after a crash at any time the file is the old one
+or the new one. Files left by a killed writer are removed by the next writer in that folder. Reading never unpickles,
+and rejects declared sizes that exceed the file's own size, so a false claim of 8 TB allocates nothing. Every failure
+raises ``FileError``.
 """
 
 import json
@@ -35,23 +35,23 @@ from hjbjax.solution.placement import (
 
 T = TypeVar("T")
 
-REASON = 400  # characters of a refusal, which may quote the file
-MAX_HEADER = 1 << 24  # bytes; the header holds settings and timings, never data
+REASON = 400  # characters of a message, which may quote the file
+MAX_HEADER = 1 << 24  # bytes; the header has settings and timings, not data
 
-# The only text that numpy writes before an array of numbers. Matched, and not evaluated as numpy does: before
-# the checksum has been compared these may be any bytes.
+# The only text that numpy writes before an array of numbers. It is matched, and not evaluated as in numpy, because it
+# may be any bytes until the checksum has been compared.
 DECLARATION = re.compile(rb"\{'descr': '([<>|]\w\d)', 'fortran_order': False, 'shape': \(([0-9, ]{0,999})\), \} *\n")
 
 
 class Expected(NamedTuple):
-    """Shapes and dtypes of which an array must have one; ``None`` in a shape matches every length."""
+    """The shapes and dtypes that an array may have; ``None`` in a shape matches any length."""
 
     shapes: tuple[tuple[int | None, ...], ...]
     dtypes: tuple[DType, ...] = (np.float64, np.float32)
     optional: bool = True
 
     def complaint(self, shape: tuple[int, ...], code: str) -> str | None:
-        """The reason why an array with this shape and dtype code, as in '<f8', is refused; ``None`` without one."""
+        """The reason why an array with this shape and dtype code, such as '<f8', is invalid; ``None`` if valid."""
         allowed = [np.dtype(dtype).str for dtype in self.dtypes]
         if code not in allowed:
             return f"has dtype {code!r}, wanted {' or '.join(allowed)}"
@@ -66,7 +66,7 @@ def _matches(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
 
 
 def _shape_text(wanted: tuple[int | None, ...]) -> str:
-    """A shape as Python writes it, with "any" for lengths that are free."""
+    """A shape as Python writes it, with "any" for arbitrary lengths."""
     return f"({', '.join('any' if n is None else str(n) for n in wanted)}{',' * (len(wanted) == 1)})"
 
 
@@ -80,17 +80,17 @@ def write(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray
       force: replace an existing file, whose permissions are kept.
 
     Raises:
-      FileExistsError: the file exists and ``force`` is false; or another process made it meanwhile.
-      FileError: the folder is missing or cannot be written, the disk is full, or a folder, a device or a pipe has that
-        name; no half file is left.
+      FileExistsError: the file exists and ``force`` is false, or another process has created it meanwhile.
+      FileError: the folder is missing or not writable, the disk is full, or the name belongs to a folder, a device or a
+        pipe; no partial file is left.
     """
     path = with_suffix(path_of(path, "written"))
     write_whole(path, lambda stream: write_archive(stream, header, arrays), force=force)
 
 
 def write_whole(path: Path, fill: Callable[[IO[bytes]], object], *, force: bool = False) -> None:
-    """Write a file whole or not at all: ``fill`` writes its bytes to a stream; refusals as for ``write``."""
-    # through links: the file behind one is replaced, not the link
+    """Write a file atomically: ``fill`` writes its bytes to a stream; errors as for ``write``."""
+    # through links: replaces the file behind a link, not the link
     path = absolute(path_of(path, "written"))
     check_place(path, force)  # before the bytes are written, and again when the file is moved
     with new_file(path) as (temporary, stream):
@@ -104,22 +104,22 @@ def write_archive(stream: IO[bytes], header: Mapping[str, Any], arrays: Mapping[
     """Write a header and arrays as a zip archive.
 
     Raises:
-      OSError: a header that is too long to be read again.
+      OSError: the header is too long to be read again.
     """
-    # A damaged table of contents may hide whole entries, and no checksum covers it: so the header has the list.
+    # A damaged table of contents may hide whole entries, and has no checksum, so the header lists the arrays.
     text = json.dumps({**header, "arrays": sorted(arrays)}, default=_plain).encode()
     if len(text) > MAX_HEADER - 1000:  # the entry's own header takes some of it
         raise OSError(f"message and statistics take {len(text):,} bytes of {MAX_HEADER:,}")
     archive = zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED)
     try:
         for name, array in {"header": np.frombuffer(text, np.uint8), **arrays}.items():
-            info = zipfile.ZipInfo(name + ".npy")  # dated 1980: equal solutions make equal files
-            # zip64, as an entry that is written piece by piece may pass 2 GiB after its header is written
+            info = zipfile.ZipInfo(name + ".npy")  # dated 1980, so that equal solutions give equal files
+            # zip64, because an entry that is written in pieces may exceed 2 GiB after its header is written
             with archive.open(info, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
         archive.close()
     except BaseException:
-        archive.fp = None  # what closing it would raise then hides Ctrl-C, and the reason of a failure
+        archive.fp = None  # otherwise an exception on closing would hide Ctrl-C, or the reason of a failure
         raise
 
 
@@ -136,10 +136,10 @@ def with_suffix(path: str) -> str:
 
 
 def _sync_folder(folder: str) -> None:
-    """Make the new name survive a power cut, where the system can: the file itself is whole either way."""
+    """Make the new name survive a power cut, if the system supports it; the file is complete in any case."""
     try:
         handle = os.open(folder, os.O_RDONLY)
-    except OSError:  # Windows opens no folders
+    except OSError:  # Windows cannot open folders
         return
     try:
         os.fsync(handle)
@@ -150,7 +150,7 @@ def _sync_folder(folder: str) -> None:
 
 
 def _plain(value: object) -> Any:
-    """A value for which JSON has no word, as a number, a list or text."""
+    """Convert a value that JSON does not support to a number, a list or text."""
     return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else str(value)
 
 
@@ -161,27 +161,27 @@ def read(
     plan: Callable[[dict], Mapping[str, Expected]],
     rebuild: Callable[[dict, dict[str, np.ndarray]], T],
 ) -> T:
-    """The object in a file that ``write`` wrote.
+    """Read an object from a file written by ``write``.
 
     Args:
       path: the file.
-      form: what ``header["format"]`` must say.
-      version: the newest ``header["version"]`` that the caller understands.
-      plan: from the header to the shapes and dtypes of the arrays.
-      rebuild: from the header and the arrays by name, less the optional ones that the file lacks, to the object.
+      form: the required ``header["format"]``.
+      version: the newest ``header["version"]`` that the caller supports.
+      plan: a function from the header to the shapes and dtypes of the arrays.
+      rebuild: a function from the header and the arrays by name, without missing optional arrays, to the object.
 
     Returns:
-      The object that ``rebuild`` makes.
+      The object returned by ``rebuild``.
 
     Raises:
-      FileError: for every kind of bad file, before anything of the size that it claims is allocated.
+      FileError: the file is invalid in any way; raised before memory of the claimed size is allocated.
     """
     path = with_suffix(path_of(path, "read"))
     try:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             raise FileError("it is a folder; give a file in it")
-        if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for ever
+        if not stat.S_ISREG(status.st_mode):  # opening a pipe would block indefinitely
             raise FileError("it is not an ordinary file")
         with open(path, "rb") as file:
             return rebuild(*_read_archive(file, status.st_size, form, version, plan))
@@ -191,19 +191,19 @@ def read(
         reason, cause = error.strerror or str(error), error
     except zipfile.BadZipFile as error:
         reason, cause = f"it is damaged: {error}", error
-    except Exception as error:  # zipfile, json and numpy raise a dozen kinds on damaged bytes
+    except Exception as error:  # zipfile, json and numpy raise a dozen types for damaged bytes
         reason, cause = f"damaged or foreign ({type(error).__name__}: {' '.join(str(error).split())[:200]})", error
     kind = MissingFileError if isinstance(cause, FileNotFoundError) else FileError
     raise kind(f"{path}: cannot be read: {screen.one_line(reason, REASON)}") from cause
 
 
 def _read_archive(file: IO[bytes], size: int, form: str, version: int, plan: Callable) -> tuple[dict, dict]:
-    """Header and arrays of an archive: first what it claims is checked, then the arrays are read."""
+    """Header and arrays of an archive; checks the declared sizes before it reads the arrays."""
     if size == 0:
         raise FileError("it is empty")
     start = file.read(4)  # a zip archive with entries begins with PK\3\4, a pickle of protocol 2 or later with \x80
     if start != b"PK\3\4":
-        what = "a pickle, which may run code and is never opened" if start[:1] == b"\x80" else "no npz file"
+        what = "a pickle, which may run code and is never opened" if start[:1] == b"\x80" else "not an npz file"
         raise FileError(f"it is {what}; wanted a file written by save()")
     try:
         archive = zipfile.ZipFile(file)
@@ -215,7 +215,7 @@ def _read_archive(file: IO[bytes], size: int, form: str, version: int, plan: Cal
             raise FileError("it has no header: not a file written by save()")
         header = _read_header(archive, members["header"], form, version)
         expected = plan(header)
-        # one way it is a damaged table of contents, the other way something that was put in later
+        # missing entries mean a damaged table of contents, additional ones were inserted later
         if wrong := set(members) ^ {"header", *header["arrays"]}:
             raise FileError(f"it does not hold the arrays that its header lists: {', '.join(sorted(wrong))}")
         for name, wanted in expected.items():
@@ -230,18 +230,19 @@ def _read_archive(file: IO[bytes], size: int, form: str, version: int, plan: Cal
 
 
 def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
-    """The entries by name, when together they can be no larger than the file and the memory."""
+    """The entries by name, after checking that together they are no larger than the file and the memory."""
     members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     if len(members) != len(archive.infolist()):
         raise FileError("an entry is there twice")
     for name, info in members.items():
-        # a few kB may unpack to gigabytes; what is stored as it is takes as many bytes of the file. Bit 0: encrypted
+        # a few kB may unpack to gigabytes, while a stored entry takes the same number of bytes of the file; bit 0:
+        # encrypted
         if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
             raise FileError(f"entry {name!r} is compressed or encrypted: not a file written by save()")
         if info.file_size != info.compress_size:
             raise FileError(f"entry {name!r} declares two sizes: it is damaged")
     total, memory = sum(info.file_size for info in members.values()), _memory()
-    if total > size:  # entries that overlap, each of which would fit
+    if total > size:  # overlapping entries, each of which would fit
         raise FileError(f"it claims {total:,} bytes of arrays and is {size:,} bytes long")
     if total > memory:
         raise FileError(f"it holds {total:,} bytes of arrays; this machine has {memory:,} bytes of memory")
@@ -249,7 +250,7 @@ def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
 
 
 def _memory() -> float:
-    """The physical memory in bytes; infinite where the system does not say."""
+    """The physical memory in bytes; infinite if the system does not report it."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):
@@ -257,13 +258,13 @@ def _memory() -> float:
 
 
 def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, form: str, version: int) -> dict:
-    """The header, when it is of this format and of a version that is known."""
+    """The header, if its format and version are supported."""
     _check_member(archive, info, Expected(((None,),), (np.uint8,)))
     header = json.loads(_read_member(archive, info).tobytes())
     if not isinstance(header, dict) or header.get("format") != form:
         raise FileError(f"its header does not say {form!r}: another program wrote it")
     found = header.get("version")
-    # JSON's true is a bool, which Python takes for the integer 1
+    # JSON's true is a bool, which Python treats as the integer 1
     if isinstance(found, bool) or not isinstance(found, int) or found < 1:
         raise FileError(f"its format version is {found!r}, wanted an integer from 1 to {version}")
     if found > version:
@@ -272,10 +273,10 @@ def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, form: str, ver
 
 
 def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, wanted: Expected) -> None:
-    """Compare shape and dtype that an npy header declares with those wanted and with the bytes that are there."""
+    """Compare the declared shape and dtype of an npy header with the wanted ones and with the size of the entry."""
     name = info.filename.removesuffix(".npy")
     with archive.open(info) as member:
-        start = member.read(10)  # magic, version 1.0, and the length of the text that follows in two bytes
+        start = member.read(10)  # magic, version 1.0, and the length of the following text in two bytes
         text = member.read(int.from_bytes(start[8:], "little"))
     declared = DECLARATION.fullmatch(text)
     if start[:8] != b"\x93NUMPY\1\0" or declared is None:
@@ -290,7 +291,7 @@ def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, wanted: Expec
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One array, when its checksum is right."""
+    """Read one array and verify its checksum."""
     with archive.open(info) as member:
         array = np.lib.format.read_array(member, allow_pickle=False)
         member.read()  # to the end, where the checksum is compared

@@ -1,22 +1,22 @@
-"""An estimate of the error of the spacing, from the answers on two grids.
+"""An estimate of the discretisation error from the values on two grids.
 
     |V − V_h| ≈ |V_h − V_rh|/(r^q − 1)
 
-with r the ratio of the spacings and c h^q the leading term of the error. The order q is measured at every node, since
-it is 2 where V is smooth, 1 next to kinks and corners, and less where V is not Lipschitz continuous. Two observations
-decide, and the lower order counts:
+where r is the ratio of the spacings and c h^q the leading term of the error. The order q is measured at every node,
+since it is 2 where V is smooth, 1 next to kinks and corners, and lower where V is not Lipschitz continuous. It is the
+lower of two observed orders:
 
-- The second-order scheme changes the answer of its chain by the chain's whole error, which is of first order. If the
-  change between grids is small compared to that, the order is 2. If both are alike, slopes gain nothing: q is 1.
+- The second-order scheme changes the value of the monotone chain by the whole first-order error of the chain. If the
+  change between the grids is much smaller than this change, q is 2. If the two changes are similar, q is 1.
 - Second differences of V fall like h² where V is smooth, like h at a kink, and not at all at a jump or in a layer that
   is thinner than a cell.
 
-A march has no answer of its chain. Its steps grow with the spacings, so the change between grids includes the error of
-the step in time. Only second differences are observed, and a kink that is carried along is smeared; see ``SMEARED``.
+A march has no separate value of the chain. Its time steps grow with the spacings, so the change between grids includes
+the time discretisation error. Only second differences are used, and an advected kink is smeared; see ``SMEARED``.
 
-First differences fall like h where V is Lipschitz continuous and not at all where V jumps. A jump is off by up to its
-height within the few cells over which the scheme smears it, which no comparison of grids measures: there the
-estimate is at least the range of V over two coarse cells.
+First differences fall like h where V is Lipschitz continuous, and not at all where V jumps. Near a jump the scheme
+smears V over a few cells and the error is up to the height of the jump. Comparing grids does not measure this, so the
+estimate there is at least the range of V over two coarse cells.
 """
 
 import dataclasses
@@ -31,31 +31,31 @@ from hjbjax.problem.grid import Grid
 from hjbjax.solution import nested_grids
 
 LEAST, FIRST, SECOND = 0.5, 1.0, 2.0  # orders
-# change between grids over change between schemes: order 2, order 1, one scheme. An order of 1/2 from 2 on made half of
-# the estimates two to seven times the error
+# ratio of the change between grids to the change between schemes at which the order is 2 or 1, or the schemes coincide.
+# An order of 1/2 for ratios from 2 on made half of the estimates two to seven times the error.
 SMOOTH, ALIKE, ONE = 0.05, 0.5, 10.0
-REACH = 2  # fine nodes to both sides of a coarse one
-# Orders of second differences and of the error without an answer of the chain. A kink that is carried along is smeared
-# over a width h^a, a = 1/2 or 2/3. Second differences fall like h^(2 − a) there, and the error like h^a. V counts as
-# smooth from STRAIGHT on; below, the change between grids may vanish at single nodes.
+REACH = 2  # fine nodes on both sides of a coarse node
+# Orders of second differences, and of the error, if there is no value of the chain. An advected kink is smeared over a
+# width h^a, a = 1/2 or 2/3. Second differences fall like h^(2 − a) there, and the error like h^a. V counts as smooth
+# from STRAIGHT on; below, the change between grids may vanish at single nodes.
 STRAIGHT = 1.9
 SMEARED = (0.5, 1.0, 1.5, 1.75, STRAIGHT), (0.5, 1.0, 0.6, 0.67, 2.0)
-BENT = 0.1  # second differences below this part of the first ones say nothing about the order
-# differences fall like h^a: a jump below the one number and none above the other; a root of the distance has ½
+BENT = 0.1  # second differences below this fraction of the first differences do not determine the order
+# differences fall like h^a: a jump if a is below JUMP, none if a is above CONTINUOUS; √distance has a = 1/2
 JUMP, CONTINUOUS = 0.3, 0.6
 
 
 @dataclasses.dataclass(frozen=True)
 class TwoGrids:
-    """The answers on two grids of one box.
+    """The values on two grids of one box.
 
     Args:
       grid: the finer grid.
-      coarse: the coarser one.
+      coarse: the coarser grid.
       value: V_h, (*grid); infinite where the target cannot be reached.
       before: V_rh, (*coarse).
       held: the fixed nodes, bool (*grid).
-      chain: the answer of the monotone chain on ``grid``, where V_h is of another scheme; else None.
+      chain: the value of the monotone chain on ``grid``, if V_h belongs to another scheme; else None.
       highest: the order of the scheme where V is smooth.
     """
 
@@ -69,7 +69,7 @@ class TwoGrids:
 
 
 def estimate(answers: TwoGrids) -> np.ndarray:
-    """|V − V_h| at the nodes, about, shape (*grid), in cost units; zero where V is infinite."""
+    """Estimate |V − V_h| at the nodes, shape (*grid), in cost units; zero where V is infinite."""
     grid, coarse, value = answers.grid, answers.coarse, answers.value
     change = nested_grids.apart(nested_grids.restrict(value, grid, coarse), answers.before)
     ratio = nested_grids.ratio_of(grid, coarse)
@@ -80,7 +80,7 @@ def estimate(answers: TwoGrids) -> np.ndarray:
     rough = _around(np.where(known, answers.before, np.nan), coarse)
     bends = _order_of_bends(fine, rough, ratio)
     if answers.chain is None:
-        for _ in range(REACH):  # the width of what is smeared
+        for _ in range(REACH):  # the width of a smeared kink
             near = _combined(bends, coarse, np.minimum)
             change = np.where(near < STRAIGHT, _combined(change, coarse, np.maximum), change)
         order = np.interp(bends, *SMEARED)
@@ -95,12 +95,12 @@ def estimate(answers: TwoGrids) -> np.ndarray:
 
 
 def is_a_point(target: np.ndarray) -> bool:
-    """True if a target, bool (*grid), has at most the nodes of one cell; on a line that is not a small target."""
+    """True if a target, bool (*grid), has at most the nodes of one cell; always False in one dimension."""
     return target.ndim > 1 and 0 < np.sum(target) <= 2**target.ndim
 
 
 class _Differences(NamedTuple):
-    """The largest first and second differences near every coarse node, and the range of V there; zero without any."""
+    """The largest first and second differences near every coarse node, and the range of V there; zero if undefined."""
 
     first: np.ndarray
     second: np.ndarray
@@ -108,7 +108,7 @@ class _Differences(NamedTuple):
 
 
 def _along_axes(value: np.ndarray, fine: Grid, coarse: Grid) -> _Differences:
-    """Of values on the finer grid, NaN where they do not count, over ``REACH`` nodes along every axis."""
+    """Differences of values on the finer grid over ``REACH`` nodes along every axis; NaN values are skipped."""
     first = second = extent = np.zeros(coarse.shape)
     for axis, count in enumerate(fine.shape):
         if count == 2:  # a chain of two states
@@ -127,7 +127,7 @@ def _along_axes(value: np.ndarray, fine: Grid, coarse: Grid) -> _Differences:
 
 
 def _around(value: np.ndarray, grid: Grid) -> _Differences:
-    """Of values on the coarser grid, NaN where they do not count, over every node and its neighbours."""
+    """Differences of values on the coarser grid over every node and its neighbours; NaN values are skipped."""
     first = second = np.zeros(grid.shape)
     for axis, count in enumerate(grid.shape):
         if count == 2:
@@ -140,34 +140,34 @@ def _around(value: np.ndarray, grid: Grid) -> _Differences:
 
 
 def _order_of_slopes(change: np.ndarray, gain: np.ndarray, coarse: Grid) -> np.ndarray:
-    """The order by the change between grids over the change between schemes, in the mean over neighbours, (*coarse)."""
+    """The order from the ratio of ``change`` to ``gain``, averaged over neighbours, (*coarse)."""
     change, gain = _combined(change, coarse, np.add), _combined(gain, coarse, np.add)
     share = np.divide(change, gain, out=np.zeros_like(change), where=gain > 0)
     order = np.interp(np.log(np.maximum(share, SMOOTH)), np.log([SMOOTH, ALIKE]), [SECOND, FIRST])
-    return np.where(share > ONE, SECOND, order)  # the schemes are one, as where noise allows central differences
+    return np.where(share > ONE, SECOND, order)  # the schemes coincide, e.g. where noise permits central ones
 
 
 def _order_of_bends(fine: _Differences, rough: _Differences, ratio: float) -> np.ndarray:
-    """The order by which second differences fall, (*coarse)."""
+    """The order at which second differences fall, (*coarse)."""
     counts = (fine.second > BENT * fine.first) & (rough.second > 0)
     return np.clip(np.where(counts, _exponent(fine.second, rough.second, ratio), SECOND), LEAST, SECOND)
 
 
 def _jumps(fine: _Differences, rough: _Differences, ratio: float) -> np.ndarray:
-    """The range of V over neighbouring cells where V jumps, by how first differences fall, (*coarse)."""
+    """The range of V over neighbouring cells where first differences indicate a jump, (*coarse)."""
     falls = _exponent(fine.first, rough.first, ratio)
     return np.clip((CONTINUOUS - falls) / (CONTINUOUS - JUMP), 0, 1) * fine.extent
 
 
 def _exponent(fine: np.ndarray, rough: np.ndarray, ratio: float) -> np.ndarray:
-    """a in fine = rough/ratio^a; one where either is zero."""
+    """The exponent a in fine = rough/ratio^a; one where either is zero."""
     counts = (fine > 0) & (rough > 0)
     quotient = np.divide(rough, fine, out=np.full(fine.shape, ratio), where=counts)
     return np.log(quotient) / np.log(ratio)
 
 
 def _padded(values: np.ndarray, grid: Grid, axis: int, beyond: float | None, reach: int = 1) -> np.ndarray:
-    """The values with more at both ends of an axis: around a period, else a number or the end itself."""
+    """Pad the values at both ends of an axis: periodically, with the number ``beyond``, or with the end value."""
     width = [(reach * (i == axis),) * 2 for i in range(grid.ndim)]
     if grid.periodic[axis]:
         return np.pad(values, width, mode="wrap")
@@ -175,7 +175,7 @@ def _padded(values: np.ndarray, grid: Grid, axis: int, beyond: float | None, rea
 
 
 def _combined(values: np.ndarray, grid: Grid, combine: Callable[[Any, Any], Any]) -> np.ndarray:
-    """The values of every node and its neighbours, combined."""
+    """Combine the values of every node and its neighbours."""
     for axis, count in enumerate(grid.shape):
         wide = _padded(values, grid, axis, None)
         below, here, above = (_part(wide, axis, k, count) for k in range(3))
@@ -184,5 +184,5 @@ def _combined(values: np.ndarray, grid: Grid, combine: Callable[[Any, Any], Any]
 
 
 def _part(values: np.ndarray, axis: int, start: int, count: int) -> np.ndarray:
-    """``count`` entries of an axis."""
+    """Take ``count`` entries along an axis, from ``start`` on."""
     return values[(slice(None),) * axis + (slice(start, start + count),)]

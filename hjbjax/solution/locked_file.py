@@ -1,8 +1,8 @@
-"""A file that one run holds locked from its beginning to its end, and replaces as often as it likes.
+"""A file that one run keeps locked from beginning to end, and may replace any number of times.
 
-The lock is on the file itself, so that no second file is left behind, and the kernel releases it with the process,
-however that ends. Each new file is locked before it gets the name, so the name is never without a lock. A file system
-without locks leaves one check: a file that another run has put there is never replaced.
+The lock is on the file itself, so no second file is left behind, and the kernel releases the lock when the process ends
+for any reason. Each new file is locked before it gets the name, so the name is never unlocked. On a file system without
+locks one check remains: a file that another run has put there is never replaced.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from typing import IO, TypeAlias
 from hjbjax.solution import files, placement
 from hjbjax.solution.placement import FileError
 
-TRIES = 100  # of opening a file that others replace meanwhile
+TRIES = 100  # attempts to open a file that others keep replacing
 Held: TypeAlias = tuple[os.stat_result, int | None]  # which file, and a handle that keeps its lock
 _made: "weakref.WeakSet[LockedFile]" = weakref.WeakSet()
 
@@ -32,11 +32,11 @@ class LockedFile:
         _made.add(self)
 
     def take(self) -> bool:
-        """Lock the file at the path; False if there is none.
+        """Lock the file at the path and return True; return False if there is none.
 
         Raises:
-          FileError: another run holds it, or it cannot be opened, or it is empty: on a file system without links that
-            is how another run reserves the name.
+          FileError: another run has locked it, or it cannot be opened, or it is empty. On a file system without links,
+            another run reserves the name with an empty file.
         """
         for _ in range(TRIES):
             placement.check_place(self.path, force=True)
@@ -56,15 +56,15 @@ class LockedFile:
                 os.close(handle)
             if self._is_own(self._there()):
                 return True
-            self.close()  # it was replaced or removed between opening and locking
-        raise FileError(f"{self.path}: others replace it again and again; give another path")
+            self.close()  # the file was replaced or removed between opening and locking
+        raise FileError(f"{self.path}: other runs keep replacing it; give another path")
 
     def write(self, fill: Callable[[IO[bytes]], object]) -> None:
-        """Replace the file, whole or not at all; the first write of a run that took none makes a new one.
+        """Replace the file atomically; the first write of a run that has not taken a file creates a new one.
 
         Raises:
-          FileExistsError: there is a file by now, and this run has none.
-          FileError: another file was put there, or none can be written.
+          FileExistsError: a file has appeared, and this run has not taken one.
+          FileError: another program has put its own file there, or the file cannot be written.
         """
         before = self._own
 
@@ -77,12 +77,12 @@ class LockedFile:
 
         try:
             files.write_whole(self.path, fill_and_lock, force=bool(before))
-        finally:  # after Ctrl-C, too, the file at the path says how far the write came
+        finally:  # the file at the path shows how far the write came, also after Ctrl-C
             there = self._there()
             self._keep([each for each in self._own if there and os.path.samestat(there, each[0])] or before)
 
     def remove(self) -> None:
-        """Remove the file, unless another one is there by now."""
+        """Remove the file, unless another program has replaced it."""
         if self._is_own(self._there()):
             with contextlib.suppress(OSError):
                 os.unlink(self.path)
@@ -92,26 +92,26 @@ class LockedFile:
         self._keep([])
 
     def _keep(self, some: list[Held]) -> None:
-        """Forget all own files but some, and close their handles."""
+        """Forget all own files except some, and close their handles."""
         others, self._own = [each for each in self._own if each not in some], some
         for _, handle in others:
             if handle is not None:
                 os.close(handle)
 
     def _there(self) -> os.stat_result | None:
-        """The file at the path, if there is one."""
+        """The identity of the file at the path; None if there is none."""
         try:
             return os.stat(self.path)
         except OSError:
             return None
 
     def _is_own(self, there: os.stat_result | None) -> bool:
-        """True if it is one of the run's own files."""
+        """True if the file is one of the run's own."""
         return there is not None and any(os.path.samestat(there, own) for own, _ in self._own)
 
 
 def _held(handle: int) -> Held:
-    """An open file, with a copy of its handle, which shares its lock; Windows replaces no open file, and gets none."""
+    """Identify an open file, with a copy of its handle that shares the lock; no handle on Windows, where it blocks."""
     return os.fstat(handle), None if placement.fcntl is None else os.dup(handle)
 
 
@@ -126,7 +126,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def _open(path: str) -> int:
-    """A handle of a file, for writing if possible: NFS locks no other."""
+    """Open a file, for writing if possible, because NFS requires this for a lock."""
     try:
         return os.open(path, os.O_RDWR)
     except OSError:

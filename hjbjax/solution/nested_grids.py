@@ -1,4 +1,4 @@
-"""Two grids of one box: coarser ones, and values carried from one to the other."""
+"""Coarser grids of the same box, and the transfer of values between the grids."""
 
 import dataclasses
 import math
@@ -10,23 +10,23 @@ import numpy as np
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered
 
-FEWEST = 12  # intervals that an axis keeps
-FEWEST_TELLING = 6  # on the coarser grid that tells the error of the finer one
-FARTHEST = 5  # the largest ratio of spacings of the two
-ROUNDING = 1e-9  # of a place between two nodes
+FEWEST = 12  # least number of intervals per axis of a coarser grid
+FEWEST_TELLING = 6  # least number of intervals on a coarser grid that estimates the error of the finer one
+FARTHEST = 5  # largest ratio of the spacings of the two grids
+ROUNDING = 1e-9  # in units of the spacing
 
 
 def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
-    """The grid with every second node of the axes that keep ``fewest`` intervals; None where no axis has so many.
+    """Coarsen the grid by two on every axis that keeps ``fewest`` intervals; None if no axis does.
 
-    Axes with an even number of intervals keep their ends and every second node, so that a node at the origin
-    stays one; odd ones are rounded up.
+    Axes with an even number of intervals keep their ends and every second node, so a node at the origin remains a node.
+    Odd numbers of intervals are rounded up.
     """
     shape = []
     for axis, count in enumerate(grid.shape):
         intervals = grid.intervals(axis)
         half = (intervals + 1) // 2
-        # count - intervals is 1, or 0 on a periodic axis, whose upper end is no node
+        # count - intervals is 1, or 0 on a periodic axis, whose upper end is not a node
         shape.append(count - intervals + half if half >= fewest else count)
     if tuple(shape) == grid.shape:
         return None
@@ -34,16 +34,16 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
 
 
 def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
-    """The coarser grid whose answer tells the error of ``grid``; None where an axis has too few intervals.
+    """The coarser grid for the estimate of the error of ``grid``; None if an axis has too few intervals.
 
-    About half of the intervals per axis. Every held node, or a held neighbour of it, lies in a coarse cell with a held
-    corner: a grid that loses a target of one node answers another problem. An axis of two nodes is a chain of two
-    states and stays.
+    It has about half the intervals per axis. Every fixed node, or a fixed neighbour of it, must lie in a coarse cell
+    with a fixed corner, since a grid that loses a one-node target poses another problem. An axis with two nodes is not
+    coarsened.
 
     Args:
       grid: the grid.
       held: the fixed nodes, bool (*grid).
-      nested: all coarse nodes are to be nodes of ``grid``.
+      nested: require that all coarse nodes are nodes of ``grid``.
     """
     many = [axis for axis, count in enumerate(grid.shape) if count > 2 or grid.periodic[axis]]
     choices = {axis: _fewer(grid.intervals(axis), nested) for axis in many}
@@ -51,7 +51,7 @@ def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | Non
         return None
     coarse = _resized(grid, {axis: tried[0] for axis, tried in choices.items()})
     if not _keeps(held, grid, coarse):
-        # axis by axis, since there are many pairs and triples
+        # each axis separately, since there are too many combinations
         kept = {axis: [few for few in tried if _keeps(held, grid, _resized(grid, {axis: few}))][:1]
                 for axis, tried in choices.items()}  # fmt: skip
         if not all(kept.values()):
@@ -63,7 +63,7 @@ def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | Non
 
 
 def _fewer(intervals: int, nested: bool) -> list[int]:
-    """The numbers of intervals to try, best first: half, other divisors, and numbers not far from half."""
+    """The numbers of intervals to try, best first: half, other divisors, then numbers close to half."""
     half = (intervals + 1) // 2
     if half < FEWEST_TELLING:
         return []
@@ -77,7 +77,7 @@ def _fewer(intervals: int, nested: bool) -> list[int]:
 
 
 def _resized(grid: Grid, intervals: dict[int, int]) -> Grid:
-    """The grid with other numbers of intervals on some axes."""
+    """The grid with new numbers of intervals on some axes."""
     shape = list(grid.shape)
     for axis, few in intervals.items():
         shape[axis] += few - grid.intervals(axis)
@@ -85,12 +85,12 @@ def _resized(grid: Grid, intervals: dict[int, int]) -> Grid:
 
 
 def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
-    """True if every held node, or a held neighbour of it, lies in a coarse cell with a held corner."""
+    """True if every fixed node, or a fixed neighbour of it, lies in a coarse cell with a fixed corner."""
     if not np.any(held):
         return True
     known = prolong(held.astype(float), fine, coarse) > 1 - ROUNDING
     kept = held & (prolong(known.astype(float), coarse, fine) > ROUNDING)
-    for axis in range(fine.ndim):  # the tip of a disc is kept with the disc
+    for axis in range(fine.ndim):  # a fixed node next to a kept one counts as kept, such as the tip of a disc
         along = np.moveaxis(kept, axis, 0)
         wide = along.copy()
         wide[1:] |= along[:-1]
@@ -100,13 +100,13 @@ def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
 
 
 def ratio_of(fine: Grid, coarse: Grid) -> float:
-    """The least ratio of the spacings of two grids over the axes on which they differ."""
+    """The smallest ratio of the spacings of two grids over the axes on which they differ."""
     ratios = [fine.intervals(axis) / coarse.intervals(axis) for axis in range(fine.ndim)]
     return min((ratio for ratio in ratios if ratio != 1), default=1.0)
 
 
 def with_faces_of(grid: Grid, coarse: Grid) -> Grid:
-    """The coarse grid with the prescribed ends of another grid of its box, at the nearest nodes."""
+    """The coarse grid with the prescribed boundary values of another grid of its box, from the nearest nodes."""
 
     def at_nodes(values: Any) -> Any:
         for axis in range(coarse.ndim):
@@ -118,27 +118,27 @@ def with_faces_of(grid: Grid, coarse: Grid) -> Grid:
 
 
 def nearest(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
-    """Node values on the finer grid at the nodes closest to those of the coarser one, (*coarse)."""
+    """Node values of the finer grid at the nodes closest to the coarse nodes, (*coarse)."""
     for axis in range(fine.ndim):
         values = np.take(values, places(fine, coarse, axis), axis=axis)
     return values
 
 
 def places(fine: Grid, coarse: Grid, axis: int) -> np.ndarray:
-    """The indices of the nodes of an axis of the finer grid that are closest to those of the coarser one."""
+    """The indices, along one axis, of the fine nodes closest to the coarse nodes."""
     return np.rint(np.arange(coarse.shape[axis]) * (fine.intervals(axis) / coarse.intervals(axis))).astype(int)
 
 
 def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
-    """Multilinear interpolation of node values on one grid of a box to the nodes of another grid of that box, (*fine).
+    """Interpolate node values multilinearly from one grid of a box to another grid of that box, (*fine).
 
-    In NumPy, which is as fast and compiles nothing.
+    Uses NumPy, which is as fast here and does not need compiling.
     """
-    # axis by axis: 2n gathers in place of 2^n
+    # axis by axis: 2n gathers instead of 2^n
     for axis, count in enumerate(fine.shape):
         if coarse.shape[axis] == count:
             continue
-        # in parts of a coarse interval; on a stretched axis, too, as both grids are images of one uniform axis
+        # in units of the coarse interval, also on a stretched axis, as both grids are images of one uniform axis
         place = np.arange(count) * (coarse.intervals(axis) / fine.intervals(axis))
         cell = np.minimum(place.astype(int), coarse.intervals(axis) - 1)
         weight = np.asarray((place - cell).reshape([-1 if i == axis else 1 for i in range(fine.ndim)]), values.dtype)
@@ -149,9 +149,9 @@ def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
 
 
 def restrict(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
-    """Node values on one grid at the nodes of a coarser one of that box, (*coarse); NumPy.
+    """Node values of one grid at the nodes of a coarser grid of that box, (*coarse); NumPy.
 
-    As they are where the nodes are the same, else by the cubic through four nodes along the axis.
+    They are copied where the nodes coincide, and otherwise interpolated by the cubic through four nodes along the axis.
     """
     for axis, count in enumerate(coarse.shape):
         many, few = fine.intervals(axis), coarse.intervals(axis)
@@ -160,12 +160,12 @@ def restrict(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
             continue
         place = np.arange(count) * (many / few)
         first = np.floor(place).astype(int) - 1
-        if not fine.periodic[axis]:  # near an end the four nearest, off the middle
+        if not fine.periodic[axis]:  # near an end the four nearest nodes
             first = np.clip(first, 0, fine.shape[axis] - 4)
         total: Any = 0
         for k in range(4):
             others = [j for j in range(4) if j != k]
-            weight = np.prod([(place - first - j) / (k - j) for j in others], axis=0)  # Lagrange's
+            weight = np.prod([(place - first - j) / (k - j) for j in others], axis=0)  # Lagrange basis polynomial
             along = weight.reshape([-1 if i == axis else 1 for i in range(fine.ndim)])
             total = total + along * np.take(values, (first + k) % fine.shape[axis], axis=axis)
         values = total
@@ -173,7 +173,7 @@ def restrict(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
 
 
 def apart(value: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """|value − other|, zero where that is not finite."""
+    """|value − other|, zero where it is not finite."""
     with np.errstate(invalid="ignore"):
         change = np.abs(value - other)
     return np.where(np.isfinite(change), change, 0)

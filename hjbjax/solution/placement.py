@@ -1,8 +1,8 @@
-"""Files put in their place in one step, and what killed writers left on the way taken away.
+"""Atomic placement of files, and removal of temporary files left by killed writers.
 
-A file is made under a hidden name in its folder and moved when it is whole: by ``os.replace`` if an older file may be
-replaced, otherwise by ``os.link``, which fails if another writer's file is there by then. The new file has the mode
-of the one it replaces.
+A file is written under a hidden name in its folder and moved when it is complete: by ``os.replace`` if an older file
+may be replaced, otherwise by ``os.link``, which fails if another writer has created the file meanwhile. The new file
+has the mode of the file it replaces.
 """
 
 import contextlib
@@ -17,45 +17,43 @@ from typing import IO, TypeAlias
 
 try:
     import fcntl
-except ImportError:  # Windows: no locks, and nothing that a dead process left is taken away
+except ImportError:  # Windows: no locks, and no removal of leftover files
     fcntl = None  # type: ignore[assignment]
 
-Path: TypeAlias = str | bytes | os.PathLike  # what the system takes for the name of a file
-NAME = 64  # bytes of a file's name that its temporary one repeats; file systems allow 255 in all
-OWN = re.compile(
-    r"\..*\.hjbjax\.tmp-(\d+)-[0-9a-f]{8}", re.DOTALL
-)  # names of what is on its way, with the writer's pid
-BLOCK = 4096  # bytes that a trial writes: what a file system allocates at least for a file
+Path: TypeAlias = str | bytes | os.PathLike  # types that the system accepts as the name of a file
+NAME = 64  # leading bytes of a file's name in its temporary name; file systems allow 255 in all
+OWN = re.compile(r"\..*\.hjbjax\.tmp-(\d+)-[0-9a-f]{8}", re.DOTALL)  # names of temporary files, with the writer's pid
+BLOCK = 4096  # size of a test file in bytes: the least that a file system allocates
 
 
 class FileError(OSError):
-    """A result file that could not be written or read; the message names the path and the reason."""
+    """A result file could not be written or read; the message names the path and the reason."""
 
 
 class MissingFileError(FileError, FileNotFoundError):
-    """A file that does not exist, for callers that catch what ``open`` raises."""
+    """A file does not exist; for callers that catch the exception of ``open``."""
 
 
 def path_of(path: Path, done: str) -> str:
     """The name of a file as text.
 
     Args:
-      path: text, bytes or a path object.
+      done: the intended operation, such as "read".
       done: what was to be done with the file, as in "read".
 
     Raises:
-      FileError: not a path, or one that no system takes: with a null byte, or with half of a surrogate pair.
+      FileError: not a path, or one that no system accepts: with a null byte, or with half of a surrogate pair.
     """
     try:
         text = os.fsdecode(path)
     except TypeError:
-        raise FileError(f"{path!r:.80}: cannot be {done}: it is no path; wanted the name of a file") from None
+        raise FileError(f"{path!r:.80}: cannot be {done}: it is not a path; wanted the name of a file") from None
     if "\0" in text:
         raise FileError(f"{path!r}: cannot be {done}: there is a null byte in the name")
     try:
         os.fsencode(text)
     except UnicodeEncodeError:
-        raise FileError(f"{path!r}: cannot be {done}: the system has no bytes for this name") from None
+        raise FileError(f"{path!r}: cannot be {done}: the system cannot encode this name") from None
     return text
 
 
@@ -72,7 +70,7 @@ def current_folder() -> str:
 
 
 def absolute(path: str) -> str:
-    """The path of a file to be written, from the root of the file system and through links.
+    """The absolute path of a file to be written, with links resolved.
 
     Raises:
       FileError: the path is relative, and the current folder has been removed.
@@ -84,20 +82,20 @@ def absolute(path: str) -> str:
 
 
 def check_place(path: str | os.PathLike[str], force: bool) -> None:
-    """Refuse a path at which no file can be put.
+    """Refuse a path where a file cannot be written.
 
     Raises:
-      FileExistsError: a file is there and ``force`` is false.
-      FileError: a folder is there, a device, or a link to itself: to replace a device would take it from the machine.
+      FileExistsError: the file exists and ``force`` is false.
+      FileError: the path is a folder, a device, which replacing would remove from the machine, or a link to itself.
     """
     try:
         mode = os.stat(path).st_mode
-    except OSError as error:  # nothing is there, or writing reports the reason
+    except OSError as error:  # the path is free, or writing will report the reason
         if error.errno == errno.ELOOP and not force:
             raise FileError(f"{path}: cannot be written: it is a link to itself") from error
         return
     if stat.S_ISDIR(mode):
-        raise FileError(f"{path}: cannot be written: it is a folder; give a file in it, as in 'run.npz'")
+        raise FileError(f"{path}: cannot be written: it is a folder; give a file in it, such as 'run.npz'")
     if not stat.S_ISREG(mode):
         raise FileError(f"{path}: cannot be written: it is a device, a pipe or a socket; give another name")
     if not force:
@@ -108,10 +106,10 @@ def check_place(path: str | os.PathLike[str], force: bool) -> None:
 def new_file(path: str) -> Iterator[tuple[str, IO[bytes]]]:
     """Context with the hidden name and the open stream of a file that ``place`` will move to ``path``.
 
-    The file is locked, and it is gone at the end unless it was moved.
+    The file is locked, and removed at the end unless it was moved.
 
     Raises:
-      FileError: whatever the system refuses on the way.
+      FileError: any error of the system.
     """
     folder, name = os.path.split(path)
     sweep(folder)
@@ -119,7 +117,7 @@ def new_file(path: str) -> Iterator[tuple[str, IO[bytes]]]:
     try:
         with open(temporary, "xb") as stream:
             lock(stream.fileno())  # the pid in the name protects the file until here
-            keep_owner_and_mode(temporary, path)  # before anything is in it that others may not read
+            keep_owner_and_mode(temporary, path)  # before it has content that others may not read
             yield temporary, stream
     except (FileError, FileExistsError):
         raise
@@ -134,18 +132,18 @@ def new_file(path: str) -> Iterator[tuple[str, IO[bytes]]]:
 
 
 def finish(stream: IO[bytes]) -> None:
-    """Bring all bytes to the disk: otherwise a power cut may leave the new name with nothing behind it."""
+    """Flush all bytes to the disk; otherwise a power cut may leave the new name without content."""
     stream.flush()
     os.fsync(stream.fileno())
-    if fcntl is None:  # Windows moves no open file; elsewhere it is open, and so locked, until it is in its place
+    if fcntl is None:  # Windows cannot move an open file; elsewhere it stays open and locked until it is moved
         stream.close()
 
 
 def try_place(path: str) -> None:
-    """Write a small file next to the file at ``path``, which a run will replace, and remove it again.
+    """Test that a run can replace the file at ``path``, by writing and removing a small file next to it.
 
     Raises:
-      FileError: no file can be written there, or that file belongs to another user, in a folder like /tmp.
+      FileError: no file can be written there, or the file belongs to another user, in a folder like /tmp.
     """
     with new_file(path) as (_, stream):
         stream.write(bytes(BLOCK))
@@ -156,20 +154,20 @@ def try_place(path: str) -> None:
 
 
 def place(source: str | os.PathLike[str], path: str | os.PathLike[str], force: bool) -> None:
-    """Move a whole file to its name in one step; without ``force`` only if that name is free at that moment.
+    """Move a complete file to its name atomically; without ``force`` only if that name is free at that moment.
 
     A file that replaces another one takes over its mode and, where permitted, its owner.
 
     Raises:
       FileExistsError: the name is taken and ``force`` is false.
-      OSError: whatever the system refuses.
+      OSError: any error of the system.
     """
     check_place(path, force)
     if force:
         keep_owner_and_mode(source, path)
         os.replace(source, path)
         return
-    # ``os.replace`` would replace a file that came after the check; a link fails if there is one
+    # ``os.replace`` would replace a file created after the check; a link fails if there is one
     try:
         try:
             os.link(source, path)
@@ -180,51 +178,51 @@ def place(source: str | os.PathLike[str], path: str | os.PathLike[str], force: b
         else:
             os.unlink(source)
     except FileExistsError:
-        check_place(path, force)  # refuses in the user's words, unless the file is gone again
+        check_place(path, force)  # raises a readable error, unless the file is gone again
         raise
 
 
 def _move_over_reservation(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Move a file to a name that an empty file takes first: of two writers one fails."""
+    """Move a file to a name that is first reserved by an empty file, so that one of two writers fails."""
     os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
     try:
         os.replace(source, path)
-    except BaseException:  # Ctrl-C among them
+    except BaseException:  # including Ctrl-C
         os.unlink(path)
         raise
 
 
 def keep_owner_and_mode(source: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Give a file the permissions of the one at ``path``, if there is one, and its owner where permitted."""
+    """Give a file the permissions of the file at ``path``, if it exists, and its owner where permitted."""
     try:
         old, new = os.stat(path), os.stat(source)
-    except OSError:  # a new file: its mode follows the umask
+    except OSError:  # for a new file the mode follows the umask
         return
     mode = stat.S_IMODE(old.st_mode) & 0o777
     if hasattr(os, "chown"):
         for owner, group in ((old.st_uid, -1), (-1, old.st_gid)):
-            with contextlib.suppress(OSError):  # only root gives files away, and groups go to their members
+            with contextlib.suppress(OSError):  # only root can change the owner, and only members the group
                 os.chown(source, owner, group)
-        if os.stat(source).st_gid != old.st_gid:  # the members of another group may do what everybody may
+        if os.stat(source).st_gid != old.st_gid:  # members of another group get the permissions of others
             mode = mode & ~0o070 | (mode & 0o007) << 3
     if mode != stat.S_IMODE(new.st_mode):
-        with contextlib.suppress(OSError):  # a file system without modes
+        with contextlib.suppress(OSError):  # some file systems have no modes
             os.chmod(source, mode)
 
 
-# --- files on their way ---
+# --- temporary files ---
 
 
 def hidden_name(name: str) -> str:
-    """A hidden name, with the writer's pid, for what will be called ``name``."""
-    start = os.fsdecode(os.fsencode(name)[:NAME])  # the limit of file systems is in bytes; half a letter does no harm
+    """A hidden temporary name, with the writer's pid, for the file ``name``."""
+    start = os.fsdecode(os.fsencode(name)[:NAME])  # the limit is in bytes; a truncated character is harmless
     return f".{start}.hjbjax.tmp-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def lock(handle: int) -> bool:
-    """Lock an open file or folder until it is closed, also by the end of the process; False if another lock is on it.
+    """Lock an open file or folder until it is closed or the process ends; False if it is already locked.
 
-    True as well on a file system without locks.
+    Also returns True on a file system without locks.
     """
     if fcntl is None:
         return True
@@ -239,7 +237,7 @@ def lock(handle: int) -> bool:
 
 @contextlib.contextmanager
 def claim(path: Path) -> Iterator[None]:
-    """Context with a lock on a folder on its way; it ends with the process, however that ends."""
+    """Context with a lock on a temporary folder; the lock ends with the process."""
     if fcntl is None:
         yield
         return
@@ -252,14 +250,14 @@ def claim(path: Path) -> Iterator[None]:
 
 
 def sweep(folder: str | os.PathLike[str]) -> None:
-    """Remove what killed writers left in a folder: files whose names hold a dead pid and that nobody has locked.
+    """Remove temporary files of killed writers from a folder: files with a dead pid in their name and without a lock.
 
-    Neither sign is enough without the other: a pid says nothing about another machine that writes into the folder, and
-    the lock comes a moment after the file.
+    Both conditions are required: the pid may belong to a process on another machine that writes into the folder, and
+    the lock is set a moment after the file is created.
     """
     if fcntl is None:
         return
-    with contextlib.suppress(OSError):  # a folder that cannot be listed is no reason not to write into it
+    with contextlib.suppress(OSError):  # if a folder cannot be listed, writing may still work
         for entry in os.scandir(folder):
             found = OWN.fullmatch(entry.name)
             if found and not _is_alive(int(found[1])):
@@ -268,24 +266,24 @@ def sweep(folder: str | os.PathLike[str]) -> None:
 
 
 def _is_alive(pid: int) -> bool:
-    """True if a process with this number runs on this machine."""
+    """True if a process with this pid runs on this machine."""
     try:
-        os.kill(pid, 0)  # signal 0 sends nothing, and only checks that it could be sent
+        os.kill(pid, 0)  # signal 0 sends nothing; it only checks that the process exists
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # PermissionError: the process of another user
+    except OSError:  # PermissionError: a process of another user
         return True
     return True
 
 
 def _remove_unclaimed(entry: os.DirEntry) -> None:
-    """Remove a file or a folder unless a living writer holds its lock."""
+    """Remove a file or a folder unless a living writer has locked it."""
     is_folder = entry.is_dir(follow_symlinks=False)
     if not is_folder and not entry.is_file(follow_symlinks=False):
         return
-    handle = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)  # a link that came meanwhile may point anywhere
+    handle = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)  # a link created meanwhile may point anywhere
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if a writer holds it
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if a writer has locked it
         shutil.rmtree(entry.path, ignore_errors=True) if is_folder else os.unlink(entry.path)
     finally:
         os.close(handle)

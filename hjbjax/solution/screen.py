@@ -1,7 +1,7 @@
-"""Text for a terminal: the printed screen of a solution, and one line of any text.
+"""Text for a terminal: the printed summary of a solution, and any text on one line.
 
-The text may come from somebody else's file. So long texts are cut first, control characters are shown as Python writes
-them, and a statistic of an unexpected type is replaced by the name of its type.
+The text may come from a file of another person. Long texts are therefore cut first, control characters are escaped as
+in Python, and a statistic of an unexpected type is replaced by the name of its type.
 """
 
 import base64
@@ -19,13 +19,13 @@ from hjbjax.problem.streams import encodable, plain
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.status import Status
 
-WIDTH = 100  # columns of the printed screen
-THUMBNAIL = 160  # pixels, and the largest number of nodes an axis that it shows
+WIDTH = 100  # columns of the printed summary
+THUMBNAIL = 160  # pixels, and the largest number of nodes per axis
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
 
 class _Answer(Protocol):
-    """The part of a solution that is printed."""
+    """The attributes of a solution that are printed."""
 
     @property
     def grid(self) -> Grid: ...
@@ -60,14 +60,14 @@ class _Answer(Protocol):
 
 
 def show(solution: _Answer) -> str:
-    """The screen of a solution: at most 15 lines; lines of which nothing is known are left out."""
+    """The printed summary of a solution: at most 15 lines; unknown entries are left out."""
     stats, grid = solution.stats, solution.grid
     axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.labels, grid.periodic, strict=True))
     last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
     reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
     compiling = f", and {number(stats['compile_seconds'])} to check and compile" if "compile_seconds" in stats else ""
     dtype = number(stats.get("dtype") or str(np.asarray(solution.value).dtype))
-    # each with its own guard: any of the statistics may be unknown, and in a file any may be of another kind
+    # each statistic is checked separately: any may be missing, and in a file any may have the wrong type
     rows = {
         "grid": f"{axes}: {' x '.join(map(str, grid.shape))} = {grid.size:,} nodes",
         "times": "" if solution.times is None else str(np.size(solution.times)),
@@ -90,17 +90,17 @@ def show(solution: _Answer) -> str:
 
 
 def _devices(stats: dict[str, Any]) -> str:
-    """The kind of the device, or of the devices that had parts of the nodes, and how they lay."""
+    """The kind of device, with the shape of the mesh if the nodes are divided among several devices."""
     kind, mesh = number(stats["device"]), stats.get("mesh")
     return f"{' x '.join(map(number, mesh))} {kind}" if isinstance(mesh, (list, tuple)) else kind
 
 
 def thumbnail(solution: _Answer) -> str:
-    """A small picture of V as HTML: a line over one axis, an image over the first two, the middle of all others.
+    """A small plot of V as HTML: a line in 1-D, otherwise an image over the first two axes at the middle of the others.
 
-    Of a marched solution at the earliest kept time. Dark is low; where V is not finite there is nothing.
+    A marched solution is shown at its earliest kept time. Dark is low; nodes where V is not finite are transparent.
     """
-    from matplotlib import colormaps, image  # a second of importing, for notebooks alone
+    from matplotlib import colormaps, image  # takes a second to import, needed in notebooks only
 
     values = np.asarray(solution.value, float)
     values = values if solution.times is None else values[0]
@@ -121,13 +121,13 @@ def thumbnail(solution: _Answer) -> str:
 
 
 def _cuts(solution: _Answer) -> str:
-    """The ends of the box at which the optimal drift is cut off, with the number of nodes at each."""
+    """The ends of the box at which the optimal drift is cut off, with the number of nodes at each end."""
     if solution.cut is None or not np.any(solution.cut):
         return ""
-    # of a marched solution the worst of the kept times, shape (n, 2)
+    # the largest count over the kept times of a marched solution, shape (n, 2)
     counts = np.max(np.asarray(solution.cut).reshape(-1, solution.grid.ndim, 2), axis=0)
 
-    # short, as a screen has one line for it: an axis takes some 30 characters
+    # short, because everything must fit on one line: an axis takes some 30 characters
     def both(lower: int, upper: int) -> str:
         return ", ".join(f"{count} {end}" for count, end in ((lower, "lower"), (upper, "upper")) if count)
 
@@ -137,11 +137,11 @@ def _cuts(solution: _Answer) -> str:
 
 
 def _error(solution: _Answer) -> str:
-    """The certified error and its certificate, or why there is none; beside it that of the monotone answer."""
+    """The certified error and its certificate, or the reason why there is none, and the error of the monotone value."""
     error, tol = solution.error, solution.stats.get("tol")
     if error is None and solution.monotone_error is not None and tol is not None:
         said = f"residual at most {number(tol)} at high order"
-        # a bound above the range of V says nothing
+        # a bound above the range of V is useless
         finite = np.asarray(solution.value)[np.isfinite(np.asarray(solution.value))]
         useful = finite.size and solution.monotone_error < np.ptp(finite)
         return f"{said}; of the monotone start at most {number(solution.monotone_error)}" if useful else said
@@ -152,7 +152,7 @@ def _error(solution: _Answer) -> str:
 
 
 def _estimate(error: Any) -> str:
-    """The largest and the mean of an error that was estimated at every node; nothing without an estimate."""
+    """The largest and the mean estimated error over the nodes; empty without an estimate."""
     if error is None:
         return ""
     found = np.asarray(error)
@@ -161,25 +161,25 @@ def _estimate(error: Any) -> str:
 
 
 def one_line(text: str, width: int = WIDTH) -> str:
-    """A text in one line of at most ``width`` characters."""
+    """A text on one line of at most ``width`` characters."""
     text = plain(text)
     return text if len(text) <= width else text[: width - 4] + " ..."
 
 
 def number(value: Any) -> str:
-    """A number in three digits; a text as it is; of anything else its type."""
+    """A number with three digits; a text unchanged; for anything else its type."""
     if arguments.is_number(value):
         return f"{float(value):.3g}"
     return value if isinstance(value, str) else f"a {type(value).__name__}"
 
 
 def percent(share: float) -> str:
-    """A share in per cent, rounded down to a tenth, so that 100 % is all and nothing else."""
+    """A fraction in per cent, rounded down to a tenth, so that 100 % means all."""
     return f"{math.floor(1000 * share) / 10:.1f} %"
 
 
 def size(count: Any) -> str:
-    """A number of bytes in the unit that suits it."""
+    """A number of bytes in a suitable unit."""
     if not arguments.is_number(count):
         return number(count)
     count, unit = float(count), 0

@@ -1,9 +1,8 @@
-"""The answer: value, policy, how it ended, and how far it can be off.
+"""Solutions: value, policy, outcome, and bounds on the error.
 
-A ``Solution`` is a pytree, so it may leave ``jit`` and ``vmap`` and be differentiated; timings and residuals
-are host matter and do not survive such a passage. Certified bounds lower ≤ V_h ≤ upper on the exact discrete
-solution V_h are affine in the value V, so that four numbers hold them; the error of V is at most
-max(upper − V, V − lower).
+A ``Solution`` is a pytree, so ``jit`` and ``vmap`` can return it and it can be differentiated. Timings and residuals
+are host data and are dropped on the way. Certified bounds lower ≤ V_h ≤ upper on the exact discrete solution V_h are
+affine in the value V, so four numbers store them. The error of V is at most max(upper − V, V − lower).
 """
 
 import dataclasses
@@ -41,9 +40,9 @@ __all__ = ["FileError", "Solution", "SolveError", "Status", "load"]
 
 
 class SolveError(RuntimeError):
-    """A solve that did not converge: the ``message`` says how it ended, ``.solution`` is the answer so far, if any.
+    """A solve did not converge: the ``message`` explains the outcome, ``.solution`` is the solution so far, if any.
 
-    ``.solutions`` are those of all lanes of a batch, the finished ones among them.
+    ``.solutions`` are the solutions of all lanes of a batch, including the finished lanes.
     """
 
     def __init__(self, message: str, solution: Any = None, solutions: Sequence[Any] = ()):
@@ -58,39 +57,39 @@ class Solution:
     """A value function on a grid with its policy.
 
     Args:
-      grid: the nodes.
-      value: V, shape (*grid), in cost units; infinite where the target is out of reach.
+      grid: the grid.
+      value: V, shape (*grid), in cost units; infinite where the target is unreachable.
       policy: u, shape (*grid, m); NaN at nodes where no control is defined.
       disturbance: d, shape (*grid, l), in a game.
       code: a ``Status`` number.
-      steps: how many steps were taken.
+      steps: number of steps.
       enclosure: shape (2, 2), or ``None`` without a certificate: the exact discrete solution is certified to lie
         between ``enclosure[0, 0] * value + enclosure[0, 1]`` and ``enclosure[1, 0] * value + enclosure[1, 1]``.
-      isaacs_gap: the largest min-max minus max-min over the nodes, in cost units per unit time, in a game.
+      isaacs_gap: in a game, the largest min-max minus max-min over the nodes, in cost units per unit time.
       reached: the nodes from which the target can be reached, bool (*grid); ``None`` means all.
-      times: shape (k,) when marched; value and policy then have a leading axis.
-      grid_error: an estimate of |V − V_exact| at the nodes, shape (*grid), in cost units, with V_exact the solution of
-        the equation itself and not of the discrete one; zero where V is infinite. When marched it includes the error of
-        the step in time, shape (k, *grid). ``None`` where none was made; ``stats["grid_error"]`` has the reason where
-        the caller left the choice of the scheme, and of every march.
-      box_error: an estimate of how far V moves if another assumption is made at the ends of the box, shape (*grid), or
-        (k, *grid) when marched, in cost units. ``None`` where the ends cannot matter or nothing was estimated;
-        ``stats["box_error"]`` has the reason.
-      monotone_error: of a value of second order the certified bound on the error of the monotone answer from which it
-        started, against the exact solution of the monotone scheme; ``None`` without one.
-      cut: at how many nodes of each end of the box the optimal drift is cut off, shape (n, 2), lower and upper; when
-        marched, the most in any step down to each kept time, (k, n, 2). Zero at ends that are not projected; ``None``
-        where it was not counted.
-      discrete: whether the controls are enumerated, so that a mean of two need not be admissible.
-      discrete_disturbance: whether the disturbances are enumerated.
-      labels: names and units of the controls, and the side of the level set, for pictures.
-      residuals: one number a step; host level.
+      times: shape (k,) for a marched solution, whose value and policy have a leading time axis.
+      grid_error: an estimate of |V − V_exact| at the nodes, shape (*grid), in cost units, where V_exact solves the
+        equation itself, not its discretisation; zero where V is infinite. For a marched solution it includes the time
+        discretisation error, shape (k, *grid). ``None`` without an estimate; ``stats["grid_error"]`` then gives the
+        reason, for marches and if the scheme was chosen automatically.
+      box_error: an estimate of the change of V under another assumption at the ends of the box, shape (*grid), or
+        (k, *grid) for a marched solution, in cost units. ``None`` if the ends cannot matter or there is no estimate;
+        ``stats["box_error"]`` gives the reason.
+      monotone_error: for a second-order value, the certified error bound of the monotone value it started from, against
+        the exact solution of the monotone scheme; otherwise ``None``.
+      cut: number of nodes at the lower and upper end of each axis at which the optimal drift is cut off, shape (n, 2);
+        for a marched solution the largest number in any step down to each kept time, (k, n, 2). Zero at ends that are
+        not projected; ``None`` if not counted.
+      discrete: True if the controls are enumerated, so that the mean of two need not be admissible.
+      discrete_disturbance: True if the disturbances are enumerated.
+      labels: names and units of the controls, and the side of the level set, for plots.
+      residuals: one number per step; host data.
       stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
-        "certificate" (a sentence), "checkpoint" ("written", or why not), "mesh" (devices along each axis, where the
-        nodes were divided) and "versions" (a dict), each where known; host level.
-      message: what happened in this very solve; empty after a passage through ``jit``; host level.
-      problem: the question, from which pictures take target and bounds; ``None`` after a passage through ``jit`` or a
-        file, as functions are not saved; host level.
+        "certificate" (a sentence), "checkpoint" ("written", or the reason why not), "mesh" (devices along each axis,
+        if the nodes were divided) and "versions" (a dict), each if known; host data.
+      message: an explanation of the outcome of this solve; empty on return from ``jit``; host data.
+      problem: the problem, for target and bounds in plots; ``None`` on return from ``jit`` or from a file, because
+        functions are not saved; host data.
 
     Example:
       >>> grid = Grid([0.0], [1.0], (3,))
@@ -127,14 +126,14 @@ class Solution:
 
     @property
     def status(self) -> Any:
-        """The ``Status``; the bare numbers while traced, or of a batch."""
+        """The ``Status``; the plain numbers while traced, or for a batch."""
         if is_traced(self.code) or np.ndim(self.code):
             return self.code
         return Status(int(self.code))
 
     @property
     def bounds(self) -> tuple[Any, Any] | None:
-        """The certified ``(lower, upper)``, each of shape (*grid), made when asked for; infinite where V is.
+        """The certified ``(lower, upper)``, each of shape (*grid), computed on access; infinite where V is.
 
         ``None`` without a certificate.
         """
@@ -142,9 +141,9 @@ class Solution:
             return None
         xp: Any = jnp if is_traced(self.value, self.enclosure) else np
         value, (factors, shifts) = xp.asarray(self.value), self._lines(xp)
-        # of a batch every lane has its own lines: factors (lanes,) against values (lanes, *grid)
+        # in a batch every lane has its own coefficients: factors (lanes,) and values (lanes, *grid)
         finite, numbers = xp.isfinite(value), (..., *(None,) * self.grid.ndim)
-        center = xp.where(finite, value, 0)  # a factor of zero times infinity would be NaN
+        center = xp.where(finite, value, 0)  # zero times infinity would be NaN
         lower, upper = (
             xp.where(finite, factors[..., side][numbers] * center + shifts[..., side][numbers], value)
             for side in (0, 1)
@@ -153,9 +152,9 @@ class Solution:
 
     @property
     def error(self) -> Any:
-        """The certified bound on |V − V_h|, the largest over the nodes where V is finite; ``None`` without one.
+        """The certified bound on |V − V_h| over the nodes where V is finite; ``None`` without a certificate.
 
-        A NaN among the values or the bounds, or no finite node at all, makes it infinite: nothing is certified.
+        It is infinite if a value or bound is NaN or if no node is finite, because nothing is certified then.
         """
         if self.enclosure is None:
             return None
@@ -169,7 +168,7 @@ class Solution:
             for side, sign in enumerate((-1, 1))
             for end in (least, most)
         ]
-        # NaN compares with nothing, and least and most look at finite values alone: neither may pass for a bound
+        # comparisons with NaN are false, and least and most ignore NaN, so NaN must be tested separately
         worst = xp.max(xp.stack(off))
         worst = xp.where(xp.isnan(worst) | xp.any(xp.isnan(value)) | ~xp.any(finite), xp.inf, worst)
         return worst if xp is jnp else float(worst)
@@ -181,57 +180,58 @@ class Solution:
 
     @property
     def residual(self) -> float | None:
-        """The last residual; ``None`` where none was kept."""
+        """The last residual; ``None`` if none was recorded."""
         return float(self.residuals[-1]) if len(self.residuals) else None
 
     def value_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
-        """V between the nodes: ``value_at(x)``, or ``value_at(t, x)`` of a marched solution; jit- and vmap-able.
+        """V between the nodes: ``value_at(x)``, or ``value_at(t, x)`` for a marched solution; works under jit and vmap.
 
-        Multilinear interpolation, second order, in the time as well. Concrete states and data give float64 NumPy;
-        under a tracer the answer has the tracer's dtype.
+        Multilinear interpolation, second order, also in time. For concrete states and data the result is float64 NumPy,
+        under a tracer it has the tracer's dtype.
 
         Args:
-          where: states x, shape (n,) or (..., n); of a marched solution first the time, a number or shape (...).
-          clamp: outside the grid, and outside the kept times, take the nearest point; otherwise NaN.
+          where: states x, shape (n,) or (..., n); for a marched solution preceded by the time, a number or shape (...).
+          clamp: use the nearest point for states outside the grid and times outside the kept times; otherwise NaN.
 
         Returns:
           Shape ``x.shape[:-1]``, in cost units.
 
         Raises:
-          ValueError: a state of another length; a time too many or too few; a batch of solutions.
-          TypeError: states that are not numbers.
+          ValueError: a state of the wrong length, a missing or unneeded time, or a batch of solutions.
+          TypeError: the states are not numbers.
         """
         return self._query("value_at", between, self.value, 0, where, clamp)
 
     def costate_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
-        """DV between the nodes, shape ``x.shape[:-1] + (n,)``; arguments and refusals as for ``value_at``.
+        """DV between the nodes, shape ``x.shape[:-1] + (n,)``; arguments and errors as for ``value_at``.
 
-        The costate of Pontryagin's principle, in current value. Central differences at the nodes (parabolas through
-        three of them beside an end), interpolated: second order where V is smooth; a kink is smeared over two cells.
-        Beside infinite values the differences are one-sided; where there are none, NaN.
+        This is the current-value costate of Pontryagin's principle. Central differences at the nodes (parabolas through
+        three nodes next to an end) are interpolated: second order where V is smooth; a kink is smeared over two cells.
+        Next to infinite values the differences are one-sided; the result is NaN where none exists.
         """
         return self._query("costate_at", slopes_between, self.value, 0, where, clamp)
 
     def control_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
-        """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and refusals as for ``value_at``.
+        """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and errors as for ``value_at``.
 
-        Only nodes of the cell where a control is defined count, with their weights scaled to sum to one, so
-        that the feedback reaches up to a target or to the edge of the reachable states; where no node of the
-        cell has one, the answer is NaN. Enumerated controls are not averaged: the nearest such node's is taken.
+        Only the nodes of the cell where a control is defined are used, with weights scaled to sum to one. The feedback
+        is therefore defined up to a target or the boundary of the reachable states. The result is NaN if the control is
+        undefined at all nodes of the cell. Enumerated controls are not averaged; the nearest node with a control
+        decides.
         """
-        # the mean of "left" and "right" is no control of a finite set
+        # the mean of two elements of a finite set is not in the set
         look = nearest if self.discrete else between_defined
         return self._query("control_at", look, self.policy, 1, where, clamp)
 
     def disturbance_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
-        """The opponent's d between the nodes, shape ``x.shape[:-1] + (l,)``; as ``control_at``."""
+        """The opponent's d between the nodes, shape ``x.shape[:-1] + (l,)``; see ``control_at``."""
         look = nearest if self.discrete_disturbance else between_defined
         return self._query("disturbance_at", look, self.disturbance, 1, where, clamp)
 
     def _query(
         self, name: str, look: Interpolation, values: Array | None, trailing: int, where: tuple, clamp: bool
     ) -> Array:
-        """Values between the nodes by the rule ``look``; of entries per node with ``trailing`` axes."""
+        """Values between the nodes by the rule ``look``; ``trailing`` is the number of axes per node."""
         if values is None:
             lacking = "policy" if name == "control_at" else "disturbance: the problem is not a game"
             raise ValueError(f"Solution.{name}: this solution has no {lacking}")
@@ -242,15 +242,15 @@ class Solution:
         if known and np.any(late := beyond(self.times, t)):
             first, last = float(np.min(self.times)), float(np.max(self.times))
             warn(
-                f"Solution.{name}: {np.sum(late)} of {np.size(late)} times lie outside the kept ones, from {first:.6g} "
-                f"to {last:.6g}, where the answer is NaN; keep more in march(..., times=), or clamp=True takes the "
-                "nearest",
+                f"Solution.{name}: {np.sum(late)} of {np.size(late)} times lie outside the kept times, from "
+                f"{first:.6g} to {last:.6g}; the result there is NaN. Keep more times with march(..., times=), or pass "
+                "clamp=True to use the nearest time",
                 UserWarning,
             )
         if not clamp and not is_traced(found, x, self.grid) and np.any(outside := self.grid.beyond(x)):
             warn(
-                f"Solution.{name}: {np.sum(outside)} of {np.size(outside)} states lie outside the grid, where the "
-                "answer is NaN; clamp=True takes the nearest point in it",
+                f"Solution.{name}: {np.sum(outside)} of {np.size(outside)} states lie outside the grid, where "
+                "the result is NaN. Pass clamp=True to use the nearest point of the grid",
                 UserWarning,
             )
         return found
@@ -258,41 +258,41 @@ class Solution:
     def predict(
         self, observation: Numbers | Sequence, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
-        """The control for an observed state, called as the policies of Stable-Baselines3 are.
+        """The control for an observed state, with the signature of the policies of Stable-Baselines3.
 
         Args:
-          observation: states x, shape (n,) or (..., n); outside the grid the nearest point in it counts.
-          state: handed back as it came: the feedback has no memory.
-          episode_start: not read, nor is ``deterministic``: the feedback is a function of the state alone.
-          deterministic: see above.
+          observation: states x, shape (n,) or (..., n); outside the grid the nearest point of the grid is used.
+          state: returned unchanged, because the feedback has no memory.
+          episode_start: ignored, because the feedback is a function of the state.
+          deterministic: ignored for the same reason.
 
         Returns:
-          ``(control, state)``, the control of shape ``x.shape[:-1] + (m,)``; NaN where there is none, as in the target.
+          ``(control, state)``, the control of shape ``x.shape[:-1] + (m,)``; NaN where undefined, as in the target.
 
         Raises:
-          ValueError: a marched solution, whose control depends on the time: ``control_at(t, x)``.
+          ValueError: a marched solution, whose control depends on time; use ``control_at(t, x)``.
         """
         return self.control_at(observation, clamp=True), state
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Write the solution to ``path``, whole or not at all; ``load`` gives back the same bits.
+        """Write the solution to ``path`` atomically; ``load`` restores the same bits.
 
-        Statistics come back as JSON has them: tuples as lists, objects as their text. A file that is replaced keeps its
-        permissions; those of a new one follow the umask.
+        Statistics are stored as JSON: tuples come back as lists, objects as their text. A file that is replaced keeps
+        its permissions; the permissions of a new file follow the umask.
 
         Raises:
-          FileExistsError: the file exists; another name or ``force=True`` helps.
-          FileError: it cannot be written; nothing is left behind.
-          ValueError: traced, or a batch: arrays that do not fit the grid.
+          FileExistsError: the file exists; choose another name or pass ``force=True``.
+          FileError: the file cannot be written; nothing is left behind.
+          ValueError: the solution is traced, or is a batch, whose arrays do not fit the grid.
         """
         if is_traced(self):
             raise ValueError("Solution.save: got a traced solution; save it outside of jit, vmap and grad")
         files.write(path, *archive.contents(self), force=force)
 
     def to_xarray(self) -> Any:
-        """An ``xarray.Dataset``: ``value``, each control and disturbance by its name, and what else there is at nodes.
+        """An ``xarray.Dataset``: ``value``, each control and disturbance by its name, and all other node arrays.
 
-        The axes have the names and units of the states, and ``time`` where marched; needs ``hjbjax[io]``.
+        The axes have the names and units of the states, and ``time`` if marched; requires ``hjbjax[io]``.
         """
         if is_traced(self) or np.ndim(self.code):
             raise ValueError(
@@ -301,14 +301,14 @@ class Solution:
         return archive.dataset(self)
 
     def to_netcdf(self, path: Path, *, force: bool = False) -> None:
-        """Write ``to_xarray()`` as netCDF for other tools, whole or not at all; ``load`` reads only files of ``save``.
+        """Write ``to_xarray()`` as netCDF for other tools, atomically; ``load`` reads only files of ``save``.
 
-        The file is made in memory first. A slash in a name, which means a path of groups in netCDF, is written as the
+        The file is made in memory first. A slash in a name would mean a path of groups in netCDF; it is written as the
         fraction slash, ⁄.
 
         Raises:
-          FileExistsError: the file exists; another name or ``force=True`` helps.
-          FileError: it cannot be written; nothing is left behind.
+          FileExistsError: the file exists; choose another name or pass ``force=True``.
+          FileError: the file cannot be written; nothing is left behind.
           ImportError: ``hjbjax[io]`` is not installed.
         """
         found = self.to_xarray()
@@ -321,7 +321,7 @@ class Solution:
         return f"Solution({status.name} after {self.steps} steps on {self.grid.size:,} nodes)"
 
     def _repr_html_(self) -> str:
-        """The screen with a thumbnail of V, for notebooks."""
+        """The printed summary with a thumbnail of V, for notebooks."""
         text = html.escape(str(self))
         if is_traced(self) or np.ndim(self.code):
             return f"<pre>{text}</pre>"
@@ -334,16 +334,16 @@ class Solution:
 
 
 def load(path: Path) -> Solution:
-    """The solution in the file ``path`` that ``Solution.save`` wrote; code in a file is never run.
+    """Load the solution in the file ``path`` written by ``Solution.save``; never runs code from the file.
 
     Raises:
-      FileError: the file is missing, truncated, damaged, foreign, of a newer format, or contradicts itself.
+      FileError: the file is missing, truncated, damaged, foreign, of a newer format, or inconsistent.
     """
     return Solution(**files.read(path, archive.FORMAT, archive.VERSION, archive.plan, archive.fields))
 
 
 def question(problem: Problem) -> dict[str, Any]:
-    """The fields of a ``Solution`` that follow from the problem alone: its words, and which sets are enumerated."""
+    """The fields of a ``Solution`` that follow from the problem: labels, and which sets are enumerated."""
     return {
         "discrete": isinstance(problem.controls, Finite),
         "discrete_disturbance": isinstance(problem.disturbances, Finite),

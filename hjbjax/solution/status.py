@@ -1,4 +1,4 @@
-"""The ways in which a solve ends, and its warnings, which name the line of the user's."""
+"""The ways in which a solve ends, and warnings that point at the line of the user's code."""
 
 import contextlib
 import enum
@@ -10,7 +10,7 @@ from hjbjax.problem import streams
 
 
 class Status(enum.IntEnum):
-    """The end of a solve; ``.message`` says what happened and what to do.
+    """The outcome of a solve; ``.message`` explains it and gives a remedy.
 
     Example:
       >>> print(Status(3), int(Status.STALLED))
@@ -28,27 +28,27 @@ class Status(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """The event and the remedy, in one sentence."""
+        """The outcome and the remedy in one sentence."""
         return MESSAGES[self]
 
     def __str__(self) -> str:
-        return self.name  # what IntEnum prints is the bare number
+        return self.name  # IntEnum prints the number
 
 
 MESSAGES = {
-    Status.RUNNING: "The solve has not ended; let it run on.",
-    Status.CONVERGED: "The residual meets the tolerance; nothing is left to do.",
-    Status.MAX_STEPS: "The steps ran out above the tolerance; raise max_steps, or go on from here with guess=.",
-    Status.STALLED: "The residual stopped falling above the tolerance; loosen tol or compute in float64.",
-    Status.DIVERGED: "The residual grew; check discount and target, take a better guess or another method.",
-    Status.NONFINITE: "NaN or infinity appeared and the last finite value is kept; check drift and cost there.",
-    Status.INTERRUPTED: "The solve was interrupted and the value so far is kept; go on from it with guess=.",
-    Status.TIME_LIMIT: "The time ran out above the tolerance; raise time_limit, or go on from here with guess=.",
+    Status.RUNNING: "The solve is still running.",
+    Status.CONVERGED: "Converged to the requested tolerance.",
+    Status.MAX_STEPS: "Reached max_steps before the tolerance; raise max_steps, or continue with guess=solution.value.",
+    Status.STALLED: "The residual stopped decreasing before the tolerance; increase tol or compute in float64.",
+    Status.DIVERGED: "The residual grew; check discount and target, or try a better guess or another method.",
+    Status.NONFINITE: "NaN or infinity appeared and the last finite value is kept; check drift and cost.",
+    Status.INTERRUPTED: "The solve was interrupted and the value so far is kept; continue with guess=solution.value.",
+    Status.TIME_LIMIT: "Reached time_limit before the tolerance; raise it, or continue with guess=solution.value.",
 }
 
 
 class SolveWarning(UserWarning):
-    """The solve went through, and something about its answer deserves attention."""
+    """The solve completed, but something about its result deserves attention."""
 
 
 _unsaid: ContextVar[list[str] | None] = ContextVar("unsaid warnings of a solve in a thread", default=None)
@@ -56,7 +56,7 @@ _unsaid: ContextVar[list[str] | None] = ContextVar("unsaid warnings of a solve i
 
 @contextlib.contextmanager
 def keeping_warnings() -> Iterator[list[str]]:
-    """Context in which ``warn`` writes into a list: in a thread no line of the user's is to be found."""
+    """Context in which ``warn`` appends to a list, because the stack of a thread does not contain the user's code."""
     said: list[str] = []
     token = _unsaid.set(said)
     try:
@@ -66,12 +66,12 @@ def keeping_warnings() -> Iterator[list[str]]:
 
 
 def warn(message: str, category: type[Warning] = SolveWarning) -> None:
-    """Warn at the line outside of the package from which the front door was called."""
+    """Warn at the line outside the package that called the public function."""
     said = _unsaid.get()
     if said is not None:
         said.append(message)
         return
-    # the line of the user's: Python shows a warning once a line, which inside the package would be once for ever
+    # Python shows a warning once per line; a line inside the package would show it only once per session
     package, frame, level = __name__.split(".")[0], sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
         frame, level = frame.f_back, level + 1

@@ -1,8 +1,8 @@
-"""A test by simulation that the feedback of a solution arrives at the target.
+"""A test by simulation that the feedback of a solution reaches the target.
 
-Without a discount, where going on costs nothing, V does not tell a policy that arrives at a reward from one that rests
-on the way. The chain of the resting policy arrives sooner or later by numerical diffusion, and pays nothing until then.
-A path of the system rests forever. Following a few paths shows the difference.
+Without a discount, and if continuing costs nothing, V does not distinguish a policy that reaches a reward from one that
+rests on the way: under the resting policy the chain still arrives eventually by numerical diffusion, and pays nothing
+until then, while a path of the system rests forever. Following a few paths shows the difference.
 """
 
 import functools
@@ -22,14 +22,14 @@ from hjbjax.problem.types import AtNodes, Nodes
 from hjbjax.solution.status import warn
 from hjbjax.tracing import components
 
-PATHS = 64  # that are followed, at most
-LONG = 20  # legs of a path, over the nodes of all axes together: about as many crossings of the box
-PROMISED = 0.05  # of the largest reward: where less is promised resting is as good as it gets
-SHARE = 0.1  # of the paths: if more never arrive that is worth a warning
+PATHS = 64  # largest number of paths
+LONG = 20  # legs per path, times the number of nodes summed over the axes: about 20 crossings of the box
+PROMISED = 0.05  # fraction of the largest reward: where less is promised, resting is equally good
+SHARE = 0.1  # fraction of the paths: if more never arrive, warn
 
 
 def warn_of_no_arrival(task: Task, state: State) -> None:
-    """Warn if the feedback never reaches the reward that V promises; host level, for a converged answer."""
+    """Warn if the feedback never reaches the reward that V promises; host level, for a converged solution."""
     if not _may_rest(task):
         return
     value, counted = np.asarray(state.value), np.asarray(task.counted)
@@ -57,17 +57,17 @@ def _may_rest(task: Task) -> bool:
     one_player = not problem.is_game and problem.noise is None and task.on.mesh is None
     if not (undiscounted and one_player) or problem.target is None or problem.exit_cost is None:
         return False
-    if task.least_cost is not None:  # kept where it is positive: who rests pays without end
+    if task.least_cost is not None:  # stored only where it is positive: resting then costs indefinitely
         return False
     if is_constrained(problem) or task.grid.sides("open") or task.grid.prescribed():
         return False
-    # where something can be earned on the way, a policy may stay away for that
+    # if something can be earned on the way, a policy may stay away for that reason
     return problem.cost is None or (task.floor is not None and bool(task.floor > np.finfo(task.tol.dtype).min / 16))
 
 
 @functools.partial(jax.jit, static_argnames="most")
 def _arrive(on: Discretisation, policy: tuple[Nodes, ...], start: list[Nodes], *, most: int) -> jax.Array:
-    """The paths of a feedback that meet the target within so many legs, bool, one per start."""
+    """The paths of a feedback that meet the target within ``most`` legs, bool, one per start."""
     on = cast(on, on.dtype)
     grid, x = on.grid, [jnp.asarray(place, on.dtype) for place in start]
     everywhere = [jnp.broadcast_to(place, grid.shape) for place in on.coordinates()]
@@ -90,7 +90,7 @@ def _arrive(on: Discretisation, policy: tuple[Nodes, ...], start: list[Nodes], *
 
 
 def _nearest(grid: Grid, x: list[AtNodes]) -> tuple[jax.Array, ...]:
-    """The indices of the nodes nearest to places."""
+    """The indices of the nodes nearest to the states."""
     found = []
     for axis, place in enumerate(x):
         lower, fraction, _ = grid._locate(axis, place)

@@ -1,17 +1,17 @@
 """Many problems on one grid at once: ``solve_batch``.
 
-Problems that differ in numbers alone share their programs. On a CPU each lane is a solve of its own, and as many run
-side by side as there are cores: JAX lets other threads in while a program runs, and a solve keeps one core busy for
-most of its time. Two cores gave 1.8 times the solves a second on 100 x 101 nodes; lanes of one ``vmap``ped loop gave
-.9 to 1.3, since sweeps are a loop over slices there, too, and every lane pays for the steps of the slowest.
+Problems that differ only in numbers share their programs. On a CPU each lane is a separate solve, and one runs
+per core in parallel: JAX releases other threads while a program runs, and a solve keeps one core busy most of
+the time. Two cores gave 1.8 times the solves per second on 100 x 101 nodes. Lanes of one ``vmap``ped loop gave 0.9 to
+1.3, since sweeps are still a loop over slices, and every lane pays for the steps of the slowest.
 
-On an accelerator, which one lane does not fill, they are lanes of one ``vmap``ped loop. It runs until its slowest lane
-stops, so finished lanes are taken out between chunks.
+On an accelerator, which a single lane does not fill, they are lanes of one ``vmap``ped loop. It runs until its slowest
+lane stops, so finished lanes are removed between chunks.
 
-With ``mesh=`` each of many devices has such a loop, over lanes of its own, and none waits for another within a chunk.
+With ``mesh=`` each device runs such a loop over its own lanes, and devices do not wait for each other within a chunk.
 
-Each lane has its own status, and one that goes NaN changes no bit of the others. Ctrl-C and the time limit end the
-lanes that still run, and those that have not begun.
+Each lane has its own status, and NaN in one does not affect the others. Ctrl-C and the time limit end all lanes that
+are running or have not started.
 """
 
 import contextlib
@@ -85,39 +85,40 @@ def solve_batch(
     resume: bool = False,
     mesh: Mesh | None = None,
 ) -> list[Solution]:
-    """Solve many problems on one grid; each answer is that of ``solve`` by this method.
+    """Solve many problems on one grid; each solution is the same as from ``solve`` with this method.
 
     Args:
       problems: problems; those with the same functions and shapes share a program, whatever their numbers.
-      grid: the nodes.
-      method: as in ``solve``, without nesting: of ``Nested`` its inner method; ``None`` picks by the problem.
+      grid: the grid.
+      method: as in ``solve``, without nesting: ``Nested`` is replaced by its inner method; ``None`` chooses by the
+        problem.
       scheme: as in ``solve``.
       tol: as in ``solve``.
       dtype: as in ``solve``.
-      max_steps: at most so many steps for each lane.
-      time_limit: at most so many seconds for all lanes, checks and compilation included.
-      throw: raise when a lane does not converge; otherwise its status says it.
+      max_steps: largest number of steps per lane.
+      time_limit: seconds for all lanes, including checks and compilation.
+      throw: raise if a lane does not converge; otherwise its status reports it.
       progress: as in ``solve``.
-      max_memory: bytes that one round of lanes may take; a batch that needs more runs in several.
-      checkpoint: as in ``solve``, like ``resume``: one file for all lanes. With it lanes run side by side, one a core,
-        on an accelerator, too.
-      resume: go on from that file if it is there, each lane to the same bits.
-      mesh: spread the lanes over all of its devices, each with lanes of its own; not with ``checkpoint``.
+      max_memory: bytes for one round of lanes; a batch that needs more runs in several rounds.
+      checkpoint: as in ``solve``, like ``resume``: one file for all lanes. Lanes then run in parallel, one per core,
+        also on an accelerator.
+      resume: continue from that file if it exists, each lane with the same bits.
+      mesh: distribute the lanes over all of its devices, each with its own lanes; not with ``checkpoint``.
 
     Returns:
-      One solution for each problem, in their order.
+      One solution per problem, in the same order.
 
     Raises:
-      ValueError: a question without an answer; the lane is named.
-      SolveError: a lane did not converge, be it by Ctrl-C; ``.solution`` is the first such, ``.solutions`` are all.
+      ValueError: a problem has no solution; the message names the lane.
+      SolveError: a lane did not converge, or was interrupted; ``.solution`` is the first such, ``.solutions`` are all.
     """
     if isinstance(problems, Problem) or not isinstance(problems, Iterable):
-        raise TypeError(f"solve_batch: got {shown(problems)}; wanted a list of problems, as in [problem]")
+        raise TypeError(f"solve_batch: got {shown(problems)}; wanted a list of problems, such as [problem]")
     lanes = list(problems)
     check_limits(max_steps, time_limit)
     for number, lane in enumerate(lanes):
         if not isinstance(lane, Problem):
-            raise TypeError(f"solve_batch: lane {number} is {shown(lane)}; wanted problems alone")
+            raise TypeError(f"solve_batch: lane {number} is {shown(lane)}; wanted only problems")
         check_arguments(lane, grid, method, scheme, tol)
     grid.check_indices()
     kind = arguments.as_dtype(dtype)
@@ -131,14 +132,14 @@ def solve_batch(
     with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
         for members in _same_program(lanes):
             first = lanes[members[0]]
-            # without nesting, whose levels the host drives one by one
+            # without nesting, because the host would drive the levels of each lane
             chosen = choose(first, grid, traced=False, method=method, divided=mesh is not None).inner
             on = Discretisation(first, grid, scheme or Upwind(subcell=True), kind)
             choices = Choices(scheme=scheme is None, method=method is None, levels=False)
             with _naming(members[0]):
                 check_on_one_state(first, grid, on.scheme)
             needed = memory.require(first, grid, chosen, kind, max_memory)
-            # one lane by itself has been held against the memory above, so that a round is never empty
+            # a single lane fits, as checked above, so a round is never empty
             for some in _rounds(members, needed, max_memory):
                 with host_loop.with_solution(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
                     members_of = {i: on.asking(lanes[i]) for i in some}
@@ -149,7 +150,7 @@ def solve_batch(
                 for index, solution in zip(some, together, strict=True):
                     solutions[index] = solution
         if solutions and not any(solution.status in CUT for solution in solutions):
-            solutions[-1] = with_last_phase(solutions[-1], clock)  # no late Ctrl-C is lost
+            solutions[-1] = with_last_phase(solutions[-1], clock)  # catches a late Ctrl-C
     for index, solution in enumerate(solutions):
         solution.stats.update({} if kept is None else {"checkpoint": kept.outcome})
         if throw and solution.status is not Status.CONVERGED:
@@ -159,7 +160,7 @@ def solve_batch(
 
 @contextlib.contextmanager
 def _naming(lane: int) -> Iterator[None]:
-    """A refusal with the lane that it is about."""
+    """Prefix errors with the lane they belong to."""
     try:
         yield
     except ValueError as refusal:
@@ -167,14 +168,14 @@ def _naming(lane: int) -> Iterator[None]:
 
 
 def _over_lanes(mesh: object, lanes: Sequence[Problem], grid: Grid, method: Method | None, checkpoint: object) -> Mesh:
-    """The mesh over which lanes are spread, if they can be.
+    """Check that lanes can be distributed over a mesh, and return it.
 
     Raises:
-      TypeError, ValueError: with what does not run on many devices.
+      TypeError, ValueError: names what does not run on several devices.
     """
     known = as_mesh(mesh, "solve_batch")
     if checkpoint is not None:
-        raise ValueError("solve_batch: lanes over the devices of a mesh have no checkpoint; leave out one of them")
+        raise ValueError("solve_batch: checkpoint= is not supported together with mesh=. Pass only one of them")
     evaluation = None if method is None else method.inner.evaluation
     calls_back = evaluation is not None and evaluation.calls_back
     if calls_back or any(checks.calls_back(problem, grid.ndim) for problem in lanes):
@@ -185,7 +186,7 @@ def _over_lanes(mesh: object, lanes: Sequence[Problem], grid: Grid, method: Meth
 
 def _same_program(problems: Sequence[Problem]) -> list[list[int]]:
     """Groups of lanes whose problems share functions and shapes, and so a program, in the order of first appearance."""
-    # numbers are leaves and may differ; functions, kinds of sets and flags are structure and cost a program each
+    # numbers are leaves and may differ; functions, kinds of sets and flags are structure, each with its own program
     flat = map(jax.tree.flatten, problems)
     return _groups((structure, tuple(np.shape(leaf) for leaf in leaves)) for leaves, structure in flat)
 
@@ -200,21 +201,21 @@ def _groups(keys: Iterable[Hashable]) -> list[list[int]]:
 
 def _rounds(members: Sequence[int], bytes_each: int, limit: int | None) -> list[Sequence[int]]:
     """Groups of lanes that fit into half of the memory together."""
-    # half of it, since the prepared tasks live on beside their stack, and rows that are taken out are copied
+    # half, because the prepared tasks coexist with their stack, and rows are copied when lanes are removed
     free = memory.available() if limit is None else int(limit)
     most = len(members) if free is None else max(1, free // 2 // max(bytes_each, 1))
     return [members[start : start + most] for start in range(0, len(members), most)]
 
 
 def _fills_with_lanes() -> bool:
-    """True if lanes run as one ``vmap``ped loop: on a device that one of them does not keep busy."""
+    """True if lanes run as one ``vmap``ped loop, on a device that a single lane does not keep busy."""
     device = host_loop.setting("jax_default_device") or jax.devices()[0]
     return getattr(device, "platform", device) != "cpu"
 
 
 def _cores() -> int:
-    """The cores that this process may use."""
-    with contextlib.suppress(AttributeError):  # Linux alone tells of ``taskset`` and of containers
+    """The number of cores that this process may use."""
+    with contextlib.suppress(AttributeError):  # only Linux reports ``taskset`` and containers
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
@@ -222,7 +223,7 @@ def _cores() -> int:
 def _solve_side_by_side(
     lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, kept: File | None, choices: Choices
 ) -> list[Solution]:
-    """The solutions of problems that share a program, by the numbers of their lanes, one thread a core."""
+    """Solve problems that share a program in parallel, one thread per core, by the numbers of their lanes."""
     settings, names = host_loop.settings(), list(lanes)
 
     def one(name: int) -> tuple[Solution, list[str]]:
@@ -234,7 +235,7 @@ def _solve_side_by_side(
         solution.stats.update(seconds=own.stepping, lanes=len(lanes), tol=tol)
         return with_last_phase(solution, own) if solution.status in CUT else solution, said
 
-    found = {names[0]: _told(names[0], *one(names[0]))}  # by itself: it compiles what the others find
+    found = {names[0]: _told(names[0], *one(names[0]))}  # first on its own, to compile the program that the others use
     with (
         ThreadPoolExecutor(_cores()) as pool,
         host_loop.progress_bar(clock.progress, {"desc": "solve_batch", "unit": " lanes", "total": len(lanes)}) as bar,
@@ -242,7 +243,7 @@ def _solve_side_by_side(
         waiting = {pool.submit(one, name): name for name in names[1:]}
         try:
             _finish(waiting, found, bar)
-        except KeyboardInterrupt:  # the second one, or by a handler of the user's own: those that run end by the clock
+        except KeyboardInterrupt:  # a second Ctrl-C, or a custom handler: running lanes end by the clock
             clock.interrupted = True
             _finish(waiting, found, None)
         finally:
@@ -251,7 +252,7 @@ def _solve_side_by_side(
 
 
 def _finish(waiting: dict[Future, int], found: dict[int, Solution], bar: Any) -> None:
-    """Wait for the lanes in the order in which they end; the first exception is raised."""
+    """Wait for the lanes in the order in which they end; raise the first exception."""
     for done in as_completed(waiting):
         found[waiting[done]] = _told(waiting[done], *done.result())
         if bar is not None:
@@ -259,7 +260,7 @@ def _finish(waiting: dict[Future, int], found: dict[int, Solution], bar: Any) ->
 
 
 def _told(name: int, solution: Solution, said: Sequence[str]) -> Solution:
-    """The solution of a lane, whose warnings are said here, at the user's line."""
+    """Return the solution of a lane, after issuing its warnings at the user's line."""
     for message in said:
         warn(f"lane {name}: {message}")
     return solution
@@ -268,7 +269,7 @@ def _told(name: int, solution: Solution, said: Sequence[str]) -> Solution:
 def _solve_together(
     lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, over: Lanes, choices: Choices
 ) -> list[Solution]:
-    """The solutions of problems that run as one loop, by the numbers of their lanes; ``choices`` as in ``solve``."""
+    """Solve problems as one loop, by the numbers of their lanes; ``choices`` as in ``solve``."""
     asked, found = dict(lanes), dict[int, Solution]()
     prepared: dict[int, tuple[Task, Assumptions, Reach | None]] = {}
     for name, on in lanes.items():
@@ -302,9 +303,9 @@ def _solve_chains(
     lanes: dict[int, Discretisation], prepared: Sequence[tuple[Task, Assumptions, Reach | None]], method: Method,
     tol: float, clock: Clock, over: Lanes, choices: Choices,
 ) -> list[Solution]:  # fmt: skip
-    """The solutions of prepared lanes that run as one loop, in their order."""
+    """The solutions of prepared lanes that run as one loop, in the same order."""
     began, names, asked, sharpen = clock.elapsed(), list(lanes), list(lanes.values()), choices.scheme
-    # a static flag, set for all lanes as soon as one has nodes out of reach, so that they share a program
+    # a static flag, set for all lanes as soon as one has unreachable nodes, so that they share a program
     has_lost = any(task.has_lost for task, _, _ in prepared)
     tasks = [dataclasses.replace(task, has_lost=has_lost) for task, _, _ in prepared]
     ended = _iterate(tasks, _starts(tasks, names, clock, over), names, clock, over)
@@ -336,7 +337,7 @@ def _solve_chains(
 
 
 def _starts(tasks: Sequence[Task], names: Sequence[int], clock: Clock, over: Lanes) -> list[Nodes]:
-    """Where the lanes start: zero, the constraint of a tube, or the answer for a discount that vanishes."""
+    """The initial values of the lanes: zero, the constraint of a tube, or the values for vanishing discounts."""
     starts: list[Nodes] = [task.start() for task in tasks]
     led = [i for i, task in enumerate(tasks) if vanishing_discounts.needs_a_way(task)]
     for discount in vanishing_discounts.VANISHING if led else ():
@@ -351,28 +352,28 @@ def _starts(tasks: Sequence[Task], names: Sequence[int], clock: Clock, over: Lan
 def _iterate(
     tasks: Sequence[Task], starts: Sequence[Nodes], names: Sequence[int], clock: Clock, over: Lanes, most: int = 10**9
 ) -> list[tuple[State, Status, np.ndarray]]:
-    """The last state, the status and the residuals of each lane; lanes whose tasks share a structure run together."""
+    """The last state, status and residuals of each lane; lanes whose tasks share a structure run together."""
     found: list[Any] = [None] * len(tasks)
-    # lanes whose certificates differ stop by different rules, which are part of the structure
+    # lanes with different certificates stop by different rules, which are part of the structure
     for members in _groups(jax.tree.structure(task) for task in tasks):
         limit = min(most, clock.max_steps)
         run = LanesRun(stacked([tasks[i] for i in members]), stacked([starts[i] for i in members]), limit, over)
         run.name = f"lanes {names[members[0]]} to {names[members[-1]]}, {tasks[0].grid.size} nodes each"
         run.between(host_loop.drive(run, clock), clock)  # once more, for lanes that were cut short
         for i, (state, code), residuals in zip(members, run.final, run.histories, strict=True):
-            # a run that ended before its first look still holds the guess as it came
+            # a run that ended before its initial evaluation still contains the raw guess
             state = with_obstacles(tasks[i], state) if code in CUT else state
             found[i] = state, code, np.concatenate(residuals)[: int(state.step) + 1]
     return found
 
 
 def _settled(settled: Settled, clock: Clock) -> Settled:
-    """The end of one lane, which may go on by itself: off a node where it rests, or by vanishing discounts."""
+    """The end of one lane, which may continue on its own: away from a rest node, or by vanishing discounts."""
     task, assumptions, reached, state, code, history, *_ = settled
     if code in CUT or not may_go_on(task, assumptions, state, code):
         return settled
-    # an answer, and a game that failed, go on from where they are; whoever was caught at rest starts anew, by the
-    # answers for vanishing discounts
+    # a converged solution and a failed game continue from their value; a lane caught at rest restarts from the values
+    # for vanishing discounts
     onwards = code is Status.CONVERGED or task.problem.is_game
     settled = settle(task, assumptions, reached, state.value if onwards else None, clock)
     return settled._replace(residuals=np.concatenate([history, settled.residuals])) if onwards else settled

@@ -1,20 +1,19 @@
-"""An estimate of the error that the ends of the box cause.
+"""An estimate of the error caused by the ends of the box.
 
-Nothing is known of V beyond the box, so every end comes with an assumption. At a projected end the drift that leaves
-is cut off and noise is reflected; at an open end V continues as a parabola. The estimate replaces the assumption by
-another one and measures how far V moves: at the other ends V continues as a straight line (as a parabola, if it was a
-line).
+V is unknown beyond the box, so every end makes an assumption. At a projected end outward drift is cut off and noise is
+reflected; at an open end V is extrapolated by a parabola. The estimate replaces the assumption by another one, in which
+V is extrapolated by a straight line (by a parabola, if it was a line), and measures the change of V.
 
-Let F be the equation on a coarse grid with the ends of the caller, and G the same equation with the other ends. V is
-the answer, restricted to the coarse grid, and W solves
+Let F be the equation on a coarse grid with the caller's ends, and G the same equation with the other ends. V is the
+solution, restricted to the coarse grid, and W solves
 
     G(W) = F(V),        box_error = |W − V|.
 
-The defect F(V) of the restricted answer stands on the right, so W = V wherever the ends do not matter, whatever error
-the coarse grid itself has. Newton's method (policy iteration) starts at V, where G(V) − F(V) is zero except at the end
+Because the defect F(V) of the restricted solution is on the right, W = V wherever the ends do not matter, whatever the
+error of the coarse grid. Newton's method (policy iteration) starts at V, where G(V) − F(V) is zero except at the end
 nodes. Its linear equations are factored on the host: with the other ends the matrix does not belong to a Markov chain,
-and relaxations need not converge. Policies improve in every step. So the estimate also sees an action that only pays
-with the other ends, such as leaving where the control stands still at a wall.
+and relaxations need not converge. Because policies improve in every step, the estimate also includes actions that pay
+only with the other ends, such as leaving where the control stands still at a wall.
 """
 
 import dataclasses
@@ -43,16 +42,16 @@ from hjbjax.solvers.coarse_levels import on_coarser
 from hjbjax.solvers.result import warn_of_cuts
 from hjbjax.solvers.settle import Settled
 
-SHARE, FEWEST, MOST = 16, 600, 3000  # nodes of the coarse grid: one in 16, but at least and at most this number
-MARCHED = 20_000  # most nodes of a coarse grid of marches for the box error only
-FACTORED = 12_000  # nodes up to which a factorisation is fast enough where a coarser grid would lose the target
-INTERVALS = 6  # intervals that an axis keeps
-STEPS = 30  # most steps of Newton's method; most problems take two or three
-SETTLED = 0.05  # the iteration ends with a step below this part of the change so far
-FARTHEST = 100  # of the range of V: a larger change means that the equation with the other ends has no solution near V
-ROUNDING = 1e-9  # changes at the end nodes below this part of the range of V are rounding
-LARGE = 0.1  # of the range of V: a larger box error is worth a warning ...
-NODES = 0.05  # ... at more than this share of the nodes
+SHARE, FEWEST, MOST = 16, 600, 3000  # nodes of the coarse grid: one in 16, within these limits
+MARCHED = 20_000  # largest coarse grid of marches for the box error only
+FACTORED = 12_000  # largest grid that is factored if a coarser one would lose the target
+INTERVALS = 6  # least number of intervals per axis
+STEPS = 30  # largest number of Newton steps; most problems take two or three
+SETTLED = 0.05  # the iteration ends with a step below this fraction of the change so far
+FARTHEST = 100  # in units of the range of V: a larger change means that the other equation has no solution near V
+ROUNDING = 1e-9  # changes at the end nodes below this fraction of the range of V are rounding
+LARGE = 0.1  # fraction of the range of V: a larger box error is worth a warning ...
+NODES = 0.05  # ... at more than this fraction of the nodes
 
 CANNOT_MATTER = "no end of the box assumes anything"
 NEVER_REACHED = "no optimal path reaches an end of the box"
@@ -61,7 +60,7 @@ UNSETTLED = "not estimated: the equation with linear ends has no solution near t
 
 
 class BoxError(NamedTuple):
-    """The estimate, or the reason that there is none; and the ends that cause it, as pairs of an axis and a step."""
+    """The estimate, or the reason why there is none, and the ends that cause it, as pairs of axis and step."""
 
     error: np.ndarray | None
     reason: str = ""
@@ -69,12 +68,12 @@ class BoxError(NamedTuple):
 
 
 def with_box_error(solution: Solution, settled: Settled, clock: Clock) -> Solution:
-    """The solution with an estimate of what the assumption at the ends of the box costs; warns where that is much.
+    """The solution with an estimate of the box error; warns if it is large.
 
     Args:
-      solution: a converged answer at host level.
+      solution: a converged solution at host level.
       settled: the end of its iteration.
-      clock: the limits; nothing is estimated once they are exceeded.
+      clock: the limits; there is no estimate once they are exceeded.
     """
     if clock.over() is not None:
         return solution
@@ -83,7 +82,7 @@ def with_box_error(solution: Solution, settled: Settled, clock: Clock) -> Soluti
 
 
 def reported(solution: Solution, found: BoxError) -> Solution:
-    """The solution with the estimate or the reason that there is none, and the warning that belongs to it."""
+    """The solution with the estimate or the reason why there is none, and the corresponding warning."""
     grid = solution.grid
     if found.error is not None:
         warn_of_box(found, np.asarray(solution.value), grid)
@@ -96,11 +95,11 @@ def reported(solution: Solution, found: BoxError) -> Solution:
 
 
 def of_solve(task: Task, value: Nodes) -> BoxError:
-    """The estimate for one stationary answer, (*grid).
+    """The estimate for one stationary solution, (*grid).
 
     Args:
-      task: the task that the answer solves, of any scheme.
-      value: the answer, (*grid); infinite where the target cannot be reached.
+      task: the task of the solution, for any scheme.
+      value: its value, (*grid); infinite where the target cannot be reached.
     """
     if other_ends(task.problem, task.grid) == task.grid.edges:
         return BoxError(None, CANNOT_MATTER)
@@ -113,7 +112,7 @@ def of_solve(task: Task, value: Nodes) -> BoxError:
 
 
 def coarse_for_marches(grid: Grid) -> Grid | None:
-    """The coarse grid of two marches of which only their difference counts; None where none is small enough."""
+    """The coarse grid for two marches of which only the difference matters; None if none is small enough."""
     wanted = int(np.clip(grid.size // SHARE, FEWEST, MARCHED))
     coarse = grid
     while coarse.size > wanted and (smaller := nested_grids.coarser(coarse, INTERVALS)) is not None:
@@ -125,8 +124,8 @@ def of_two_marches(first: np.ndarray, second: np.ndarray, coarse: Grid, value: N
     """The estimate for a march: the difference between two marches on a coarse grid, (k, *fine).
 
     Args:
-      first: V at k times by a march with the ends of the caller, (k, *coarse).
-      second: the same with other ends.
+      first: V at k times by a march with the caller's ends, (k, *coarse).
+      second: the same with the other ends.
       coarse: their grid.
       value: V at the kept times, (k, *fine), whose range is the scale.
       fine: the grid of the estimate.
@@ -139,9 +138,9 @@ def of_two_marches(first: np.ndarray, second: np.ndarray, coarse: Grid, value: N
 
 
 def other_ends(problem: Problem, grid: Grid) -> tuple:
-    """The kinds of ends that the estimate compares with; those that assume nothing stay as they are.
+    """The kinds of ends to compare with; ends without an assumption stay.
 
-    A constrained end is part of the problem, but noise that is reflected there is an assumption.
+    A constrained end is part of the problem, but the reflection of noise there is an assumption.
     """
     others = {"projected": "linear", "linear": "open", "open": "linear"}
     if problem.noise is not None:
@@ -150,7 +149,7 @@ def other_ends(problem: Problem, grid: Grid) -> tuple:
 
 
 def _coarse_task(task: Task) -> Task | None:
-    """The task of the chain on a grid that is small enough to be factored; None where the problem has none."""
+    """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
     on = dataclasses.replace(task.on.chain, mesh=None)
     level = dataclasses.replace(task, on=on)
     wanted = int(np.clip(task.grid.size // SHARE, FEWEST, MOST))
@@ -191,7 +190,7 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
 
 @jax.jit
 def _defect(task: Task, value: Field) -> tuple[Field, bellman.Greedy]:
-    """V with the prescribed values put in, and its policy with what V leaves of the equation where actions matter.
+    """V with prescribed values inserted, and its policy with the defect of V where actions matter.
 
     The actions are results too, because XLA would otherwise recompute them in every branch of the defect.
     """
@@ -214,9 +213,10 @@ def _equation(on: Discretisation, value: Field, obstacles: Obstacles, defect: Fi
 
 
 def _fixed_next_to_lost(task: Task) -> Obstacles:
-    """The obstacles, with the neighbours of unreachable nodes fixed as well.
+    """The obstacles, with the neighbours of unreachable nodes fixed too.
 
-    Unreachable nodes hold a number far above all others. Continued beyond an end next to them it would be far below.
+    Unreachable nodes store a number far above all others; extrapolated beyond an end next to them it would be far
+    below.
     """
     if task.lost is None:
         return task.obstacles
@@ -249,13 +249,13 @@ def warn_of_box(found: BoxError, value: np.ndarray, grid: Grid) -> None:
 
 
 def _remedy(kinds: set[str]) -> str:
-    """What to do about ends of these kinds."""
+    """The remedy for ends of these kinds."""
     if kinds & {"open", "linear"}:
         return (
-            "Take a larger box, or a coordinate in which V grows like a parabola at most, or prescribe V at these ends "
+            "Use a larger box, or a coordinate in which V grows like a parabola at most, or prescribe V at these ends "
             "by a target."
         )
     return (
-        "Take a larger box. If the state may not leave it, use Grid(..., edges='constrained'); if the problem goes on "
+        "Use a larger box. If the state may not leave it, use Grid(..., edges='constrained'); if the problem goes on "
         "beyond, edges='open' or 'linear'."
     )

@@ -1,4 +1,4 @@
-"""Coarser grids: their tasks, and the guess that their answers give for the finest grid."""
+"""Coarser grids: their tasks, and the guess that their solutions give for the finest grid."""
 
 import dataclasses
 from typing import Any
@@ -23,17 +23,17 @@ from hjbjax.solvers.vanishing_discounts import warm
 def start(
     task: Task, scheme: Scheme, method: Method, guess: Nodes | None, clock: Clock, *, asked_again: bool
 ) -> tuple[Nodes | None, list[tuple[int, ...]]]:
-    """The guess for the finest grid: the user's, or the answer of coarser grids; and the shapes of those grids.
+    """The guess for the finest grid, from the user or from coarser grids, and the shapes of those grids.
 
-    If the clock stops the solve meanwhile: the answer so far, on the finest grid; None if there is none.
+    If the clock stops the solve meanwhile, the guess is the value so far, on the finest grid; None if there is none.
 
     Args:
       task: the task of the chain on the finest grid.
-      scheme: the scheme of the answer on that grid.
-      method: the method that was chosen, which may be nested.
+      scheme: the scheme of the solution on that grid.
+      method: the chosen method, which may be nested.
       guess: the user's guess, or None.
       clock: the limits.
-      asked_again: true if the next coarser grid will be solved again to estimate the error of the grid, so that its
+      asked_again: True if the next coarser grid will be solved again to estimate the error of the grid, so that its
         program is compiled in any case.
     """
     # an undiscounted tube has many fixed points; from its constraint the iteration finds the right one
@@ -55,7 +55,7 @@ def start(
 
 
 def finite(task: Task, state: State) -> np.ndarray:
-    """The value, with the largest of the others at lost nodes, whose huge values would spoil an interpolation."""
+    """The value, with unreachable nodes set to the largest other value, because huge values spoil interpolation."""
     value, counted = np.asarray(state.value), np.asarray(task.counted)
     return np.where(counted, value, np.max(value[counted])) if task.has_lost else value
 
@@ -63,7 +63,7 @@ def finite(task: Task, state: State) -> np.ndarray:
 def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> list[Task]:
     """The tasks on coarser grids, coarsest first, down to the number of nodes that the method names.
 
-    With ``asked_again`` the next coarser grid is there in any case, if it can tell the error of the grid.
+    With ``asked_again`` the next coarser grid is there in any case, if it can estimate the error of the grid.
     """
     found: list[Task] = []
     smaller = (telling(task) if asked_again else None) or below(task.grid, method)
@@ -78,14 +78,14 @@ def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> li
 
 
 def below(grid: Grid, method: Method) -> Grid | None:
-    """The next coarser grid, if it has at least as many nodes as the method demands of the coarsest."""
+    """The next coarser grid, if it has at least the method's least number of nodes for the coarsest grid."""
     smaller = nested_grids.coarser(grid)
     return None if smaller is None or method.coarsest is None or smaller.size < method.coarsest else smaller
 
 
 def telling(task: Task) -> Grid | None:
-    """The coarser grid whose answer tells the error of the task's grid; None if there is none."""
-    # only for nodes of the finer grid is it known which of them cannot reach the target
+    """The coarser grid for the estimate of the error of the task's grid; None if there is none."""
+    # only for nodes of the finer grid it is known which of them cannot reach the target
     fixed = np.broadcast_to(np.asarray(task.obstacles.fixed), task.grid.shape)
     return nested_grids.telling(task.grid, fixed, nested=task.has_lost)
 
@@ -96,14 +96,14 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
     strides = [divmod(fine.intervals(axis), coarse.intervals(axis)) for axis in range(fine.ndim)]
     # ``outflow``, the rate of the fastest action, depends on the spacings
     if task.outflow is None and not any(rest for _, rest in strides):
-        # what is known of all nodes is known of every second one
+        # data at all nodes restricts to every second node
         every = tuple(slice(None, None, stride) for stride, _ in strides)
         # leave out problem and grid, whose leaves may have the shape of the nodes by chance
         bare: Any = dataclasses.replace(task, on=None)  # type: ignore[arg-type]
         known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
         on = task.on.on_grid(coarse)
         made = dataclasses.replace(known, on=_kept(on) if cut_cells.keeps(on) else on)
-    elif task.has_lost:  # of nodes in between it is not known whether they reach the target
+    elif task.has_lost:  # it is unknown if the nodes in between reach the target
         return None
     else:
         level = task.on.chain.on_grid(coarse)

@@ -1,4 +1,4 @@
-"""The answer on the next coarser grid, which tells the error of the grid."""
+"""The solution on the next coarser grid, for the estimate of the error of the grid."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ UNSETTLED = "not estimated: the solve on the coarser grid ended {}"
 
 
 class CoarserAnswer(NamedTuple):
-    """The answer on a coarser grid, infinite at lost nodes; or the reason why there is none."""
+    """The solution on a coarser grid, infinite at unreachable nodes, or the reason why there is none."""
 
     grid: Grid | None
     value: np.ndarray | None = None
@@ -27,7 +27,7 @@ class CoarserAnswer(NamedTuple):
 
 
 def coarser_answer(settled: Settled, clock: Clock) -> CoarserAnswer:
-    """The answer on the next coarser grid, by the scheme of ``settled`` and from its value."""
+    """The solution on the next coarser grid, by the scheme of ``settled`` and started from its value."""
     task, fine = settled.running, settled.task.grid
     coarse = telling(task)
     if coarse is None:

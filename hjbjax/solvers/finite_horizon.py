@@ -1,7 +1,7 @@
-"""The front door of finite horizons: ``march``.
+"""Finite horizons: ``march``.
 
-At host level it validates, finds the longest stable step, goes backward in chunks of about half a second from
-one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
+At host level it validates the arguments, computes the longest stable step, steps backward in chunks of about half a
+second from one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
 """
 
 import itertools
@@ -44,9 +44,9 @@ from hjbjax.solvers.stationary import check_node_values
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
-ROUNDING = 1e-12  # relative, by which a kept time may lie beyond the horizon
-PROBES = 33  # times at which a given step, and constrained ends, are held against a time-dependent problem
-FEWEST = 100  # steps where no stability limit is known for all of them: implicit, or rates by samples
+ROUNDING = 1e-12  # relative amount by which a kept time may exceed the horizon
+PROBES = 33  # times at which a given step, and constrained ends, are checked for a time-dependent problem
+FEWEST = 100  # number of steps if no stability limit is known in advance: implicit, or sampled rates
 
 _stable = jax.jit(time_stepping.stable, static_argnames="tableau")
 _obstacles = jax.jit(bellman.obstacles)
@@ -78,46 +78,47 @@ def march(
 
     min{ max{ β V − V_t − H(x, DV, D²V), V − ψ }, V − g } = 0,  V(·, horizon) = terminal cost (else ψ, else g, else 0).
 
-    Order 1 in space with ``Upwind(...)``, monotone, which never leaves the range that the data allow; 2 with
-    ``Limited()`` or ``Eno2()`` and 5 with ``Weno5()`` where V is smooth. In time see ``Explicit`` and ``Implicit``.
+    The scheme has order 1 in space with ``Upwind(...)``, which is monotone and keeps V in the range of the data; where
+    V is smooth, order 2 with ``Limited()`` or ``Eno2()`` and 5 with ``Weno5()``. For the order in time see ``Explicit``
+    and ``Implicit``.
 
     Args:
-      problem: the question; its functions may depend on the time.
-      grid: the nodes.
+      problem: the problem; its functions may depend on time.
+      grid: the grid.
       horizon: T > 0, in units of time.
-      times: the times to keep, increasing, in [0, horizon]; ``None`` is (0.0,). Nothing else is kept.
-      start: node values at the horizon in place of the terminal cost, shape (*grid), to go on from another march.
+      times: the times to keep, increasing, in [0, horizon]; ``None`` is (0.0,). Nothing else is stored.
+      start: node values at the horizon instead of the terminal cost, shape (*grid), to continue another march.
       scheme: ``Upwind(...)``, ``Limited()``, ``Eno2()`` or ``Weno5()``; ``None`` is ``Limited(split=True)``, of second
-        order, or ``Upwind(split=True)`` for implicit steps: a game whose players drive one component is upwinded player
-        by player, see ``Upwind``.
-      method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, of any step.
-      step: the longest time step; ``None`` is the stable one, and a hundredth of the horizon if implicit or if the
-        fastest action may be between the samples of its set. Where the functions depend on the time it is a hundredth,
-        and down to a 6400th of the horizon where they change faster.
-      inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops,
-        DIVERGED, where the worst disturbance reaches that bound in this share of the grid's box about its middle,
-        since a value that blows up does. ``None`` is 0, never: the bound is a part of the problem.
-      policy: whether the policy comes with the value; else V alone is kept, as by ``ValueIteration(policy=False)``.
+        order, or ``Upwind(split=True)`` for implicit steps: in a game whose players drive the same component, each
+        player's drift is upwinded separately, see ``Upwind``.
+      method: ``Explicit(...)``, the default, whose steps the grid limits, or ``Implicit(...)``, with any step.
+      step: the longest time step; ``None`` is the stable one, or a hundredth of the horizon if the method is implicit
+        or the fastest action may be between the samples of its set. If the functions depend on time it is a hundredth
+        of the horizon, and down to a 6400th where they change faster.
+      inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops with
+        DIVERGED when the worst disturbance reaches that bound in this fraction of the grid's box about its middle,
+        which indicates that the value blows up. ``None`` is 0, never: the bound is part of the problem.
+      policy: return the policy with the value; otherwise only V is stored, as in ``ValueIteration(policy=False)``.
       dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
-      time_limit: at most so many seconds, checks and compilation included.
-      throw: raise when the march does not come to its end; otherwise the status says it.
-      progress: say each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
-      max_memory: bytes that the march may take, instead of what is free.
-      checkpoint: as in ``solve``, like ``resume``; the slices at kept times go into it.
-      resume: go on from that file if it is there, to the same bits; host level.
+      time_limit: seconds, including checks and compilation.
+      throw: raise if the march does not finish; otherwise the status reports it.
+      progress: print each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
+      max_memory: bytes that the march may use, instead of the free memory.
+      checkpoint: as in ``solve``, like ``resume``; it includes the slices at kept times.
+      resume: continue from that file if it exists, with the same bits; host level.
       mesh: as in ``solve``.
 
     Returns:
-      The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), the policy likewise. One that stopped early
-      holds the times that it came to, and the last one it reached; one cut short by the time or by Ctrl-C may have no
-      policy there, which is NaN. Inside ``jit``, ``vmap`` and ``grad`` the
-      value is traced; there ``horizon``, ``times`` and ``step`` must be known numbers. A step above the stability limit
-      makes it NaN, derivatives included, and so does any other fault, unless ``throw=False``.
+      The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), and similarly the policy. If the march stopped
+      early, it contains the kept times that were reached, and the last time reached; after a time limit or Ctrl-C the
+      policy there may be missing, which is NaN. Inside ``jit``, ``vmap`` and ``grad`` the value is traced, and
+      ``horizon``, ``times`` and ``step`` must be known numbers. A step above the stability limit, or any other fault,
+      makes it and its derivatives NaN, unless ``throw=False``.
 
     Raises:
-      ValueError: a bad argument; a step above the stability limit.
-      MemoryError: a grid that does not fit, before anything is compiled.
-      SolveError: the march stopped early, with the partial solution as ``.solution``.
+      ValueError: an argument is invalid, or the step is above the stability limit.
+      MemoryError: the grid does not fit; raised before anything is compiled.
+      SolveError: the march stopped early; the partial solution is ``.solution``.
 
     Example:
       >>> import hjbjax as hjb
@@ -144,7 +145,7 @@ def march(
         return _march_traced(on, horizon, kept, start, method, step, inner, throw)
     kind = arguments.as_dtype(dtype)
     if np.any(np.diff(kept.astype(kind)) <= 0):
-        raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; leave one out")
+        raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; remove one")
     check_node_values(start, grid, "march: start")
     grid.check_spacings(kind)
     clock = Clock(seconds=time_limit, progress=progress, together=spans_processes(mesh))
@@ -152,10 +153,10 @@ def march(
         checkpoint, [problem], grid, resume=resume, caller="march", together=clock.together, horizon=horizon,
         times=kept, start=start, method=method, scheme=scheme, step=step, inner=inner, policy=policy, dtype=kind,
     )  # fmt: skip
-    # float64 for this call alone: the caller's own programs, and other threads, keep the type they have
+    # float64 for this call only: the caller's own programs, and other threads, keep their type
     with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as file:
         clock.journal = file and file.journal()
-        # within a second: what one state shows to be wrong, and a grid that does not fit, for which functions are read
+        # within a second: errors visible at a single state, and a grid that does not fit
         check_on_one_state(problem, grid, scheme)
         on = Discretisation(problem, grid, scheme, kind, mesh=mesh)
         needed = memory.fitting(memory.of_march(on, len(kept), method, policy=policy), grid, max_memory)
@@ -224,7 +225,7 @@ def _on_host(
     """The task of a march, and its solution as far as the clock allows.
 
     Raises:
-      Stopped: the clock said stop before the first step.
+      Stopped: the clock stopped the march before the first step.
     """
     _check_nodes(on, horizon, clock)
     task = _prepare(on, horizon, method, step, inner, policy=policy)
@@ -233,24 +234,24 @@ def _on_host(
 
 
 def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:
-    """Look at the values of the problem's functions at all nodes, then leave the clock at the preparation."""
+    """Check the values of the problem's functions at all nodes, then leave the clock at the preparation."""
     problem = on.problem
     node_checks.values(on.asking(_without_moving_target(problem)), clock)
-    # a drift that changes in time may keep inside a constrained end now and not later
+    # a drift that depends on time may respect a constrained end at one time and not at another
     for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
         admissibility.values(problem, on.grid, on.dtype, t)
     clock.enter("the preparation")
 
 
 def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None, code: Status) -> Solution:
-    """The solution of a march that ended before its first step: the value it was to start from; NaN if not known."""
+    """The solution of a march that ended before its first step: its initial value; NaN if unknown."""
     value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
     message = f"The march did not leave t = {horizon:g}. {march_run.ADVICE[code]}"
     return altered(solution_at_start(on, value, code), times=np.array([horizon]), message=message)
 
 
 def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, step: object, time_limit: object) -> None:
-    """Refuse arguments with which no march can start; needs no values of the problem's functions."""
+    """Refuse arguments with which no march can start, without evaluating the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
     schemes.check(scheme, "march: scheme", grid)
@@ -273,12 +274,12 @@ def _times(horizon: float, times: Sequence[float] | Array | None) -> tuple[float
     except (TypeError, ValueError):
         kept = np.zeros(())
     if kept.ndim != 1 or kept.size == 0 or not np.all(np.isfinite(kept)):
-        raise ValueError(f"march: times = {times!r}; wanted numbers in [0, horizon], as in np.linspace(0, horizon, 21)")
+        raise ValueError(f"march: times = {times!r}; wanted numbers in [0, horizon], e.g. np.linspace(0, horizon, 21)")
     if np.any(np.diff(kept) <= 0):
         first = int(np.argmax(np.diff(kept) <= 0))
         raise ValueError(
             f"march: times are not increasing: times[{first}] = {kept[first]:g}, times[{first + 1}] = "
-            f"{kept[first + 1]:g}; sort them, as in np.unique(times)"
+            f"{kept[first + 1]:g}; sort them, for example with np.unique(times)"
         )
     if kept[-1] > horizon >= kept[-1] * (1 - ROUNDING):  # 3 × 0.1 is more than 0.3
         kept[-1] = horizon
@@ -288,7 +289,7 @@ def _times(horizon: float, times: Sequence[float] | Array | None) -> tuple[float
 
 
 def _without_moving_target(problem: Problem) -> Problem:
-    """The problem without a target that may lie outside the box at the one time that is checked."""
+    """The problem without its target if this depends on time, since it may be outside the box when checked."""
     if not problem.time_dependent or problem.target is None:
         return problem
     names = ("cost", "controls", "disturbances", "noise", "discount", "terminal_cost", "stopping_cost", "running_max")
@@ -298,18 +299,18 @@ def _without_moving_target(problem: Problem) -> Problem:
 def _prepare(
     on: Discretisation, horizon: float, method: TimeMethod, step: float | None, inner: float | None, *, policy: bool
 ) -> March:
-    """The task of a march, all arrays in its type, with a prescribed step checked against the limit."""
+    """The task of a march, all arrays in its dtype, with a given step checked against the limit."""
     on, dtype = cast(on, on.dtype), on.dtype
     problem, grid = on.problem, on.grid
     moving = problem.time_dependent
     limit: Scalar = jnp.asarray(jnp.inf, dtype)
     method = method.filled(on, march_evaluation(problem, grid, divided=on.mesh is not None))
     if method.limited:
-        # 1/(max Q + β) changes with the time if the functions do: a given step is held against the least of many, one
-        # that is left open is found anew before every step
+        # For functions of time 1/(max Q + β) depends on time. A given step is checked against the least of many values;
+        # otherwise the step is computed before every step.
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
-            # the Euler steps inside a stage are c Δt long, and c Δt (max Q + β) ≤ 1 is what keeps them monotone
+            # the Euler steps inside a stage have length c Δt, and are monotone if c Δt (max Q + β) ≤ 1
             shares = jnp.stack([jnp.asarray(share, dtype) for share in (1 / method.tableau.euler, method.courant)])
             limits = jnp.stack([_stable(on.at(jnp.asarray(t, dtype)), method.tableau, shares) for t in probes])
             stable, own = jnp.min(limits, axis=0)
@@ -323,7 +324,7 @@ def _prepare(
         time_probes.report(found, horizon, step)
         longest, left = (found.lengths[:, None], found.left) if step is None else (step, 0.0)
     elif step is None and (looks[0] or not method.limited):
-        longest = horizon / FEWEST  # rates that are found on the way say nothing of the first steps
+        longest = horizon / FEWEST  # rates found during the march do not limit its first steps
     obstacles = None if moving or not policy else _obstacles(on)
     return March(
         on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(longest, dtype),
@@ -335,39 +336,39 @@ def _prepare(
 
 
 def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool, bool]:
-    """Three flags: steps must look at the rates and at correlated noise under their actions, and at Isaacs' gap."""
+    """Three flags: steps must check the rates, correlated noise under their actions, and Isaacs' gap."""
     problem = on.problem
     players, moving = players_of(on), problem.time_dependent
-    # Q is known beforehand where it is largest at an end of the sets; else under the actions that are chosen alone
+    # Q is known in advance if it is largest at an end of the sets; otherwise only under the chosen actions
     sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
-    # a stage after the first looks at a later time, at which Q may have grown beyond the limit of the first
+    # a stage after the first is at a later time, at which Q may exceed the limit of the first
     rates = method.limited and (sampled or (moving and len(method.tableau.means) > 1))
-    # where the players act apart, min max is max min node by node
+    # if the players are decoupled, min max equals max min at every node
     gap = problem.is_game and not players.decoupled
     return rates, callable(problem.noise) and (moving or players.steers_noise), gap
 
 
 def _checks_cut(on: Discretisation) -> bool:
-    """True if drift that changes in time may leave between two kept times; ends that are divided are not looked at."""
+    """True if time-dependent drift may leave between two kept times; not checked if nodes are divided."""
     return on.problem.time_dependent and on.mesh is None and bool(on.grid.sides("projected"))
 
 
 def _check_step(step: float | None, limit: float) -> None:
     """Refuse a step longer than the stability limit."""
-    # who computes the limit by hand is off by rounding, in float32 by some 1e-7
+    # allow for rounding in a limit computed by the caller, some 1e-7 in float32
     if step is not None and step > limit * (1 + 1e-6):
         raise ValueError(
             f"march: step = {step:g} is above the stability limit 1/(max Q + β) = {limit:.6g} of explicit steps "
-            "on this grid;\nleave step out, or use method=hjb.Implicit()"
+            "on this grid;\nremove step, or use method=hjb.Implicit()"
         )
 
 
 def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
-    """The nodes where a disturbance at its bound is taken for a blow-up; or None."""
+    """The nodes where a disturbance at its bound indicates a blow-up; or None."""
     problem, grid = on.problem, on.grid
     share = 0.0 if share is None else share
     if not arguments.is_number(share) or not 0 <= share <= 1:
-        raise ValueError(f"march: inner = {share!r}; wanted the share of the box that is watched, from 0 (none) to 1")
+        raise ValueError(f"march: inner = {share!r}; wanted the fraction of the box to watch, from 0 (none) to 1")
     if share == 0:
         return None
     if not isinstance(problem.disturbances, Box):
@@ -389,8 +390,8 @@ def _march_traced(
     """The solution of a march inside a JAX transformation, in a scan of fixed length: no chunks, no value checks."""
     if step is None:
         raise ValueError(
-            "march: inside jit, vmap and grad the number of steps must be known: give step=, for explicit steps at "
-            "most 1/(max Q + β) of every problem that comes"
+            "march: inside jit, vmap and grad the number of steps must be known: pass step=, for explicit steps at "
+            "most 1/(max Q + β) of every problem"
         )
     kind, problem, grid = on.dtype, on.problem, on.grid
     on, method = cast(on, kind), method.filled(on, march_evaluation(problem, grid))
@@ -403,7 +404,7 @@ def _march_traced(
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
     fine = _is_stable(on, method, horizon, step)
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
-        # an interval of a whole number of steps takes no step more by rounding; a kept time at the horizon takes none
+        # rounding must not add a step to an interval of a whole number of steps, nor one for a kept time at the horizon
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
         (value, ok), count = time_stepping.repeat(task, value, begin, end, steps), count + steps
         fine &= ok & jnp.all(jnp.isfinite(value))
@@ -416,7 +417,7 @@ def _march_traced(
         for player in (0, 1)
     )
     found = jnp.stack(values[::-1]), u[::-1], d[::-1]
-    if throw:  # a factor and no `where`, so that derivatives are NaN as well
+    if throw:  # a factor instead of `where`, so that derivatives are NaN too
         found = jax.tree.map(lambda array: array * jnp.where(fine, 1, jnp.nan).astype(kind), found)
     code = jnp.where(fine, Status.CONVERGED, Status.STALLED if method.monotone_only else Status.DIVERGED)
     return Solution(
@@ -426,7 +427,7 @@ def _march_traced(
 
 
 def _is_stable(on: Discretisation, method: TimeMethod, horizon: float, step: float) -> jax.Array:
-    """True if steps of this length are stable at the times that are held against it, as far as rates are known."""
+    """True if steps of this length are stable at the checked times, as far as rates are known."""
     if not method.limited:
         return jnp.ones((), bool)
     on = jax.lax.stop_gradient(on)

@@ -1,11 +1,11 @@
-"""The host's loop around jitted steps, which ``solve``, ``march`` and ``solve_batch`` share, and what breaks it.
+"""The host's loop around jitted steps, shared by ``solve``, ``march`` and ``solve_batch``, and its interruptions.
 
-A ``Run`` goes on in chunks of steps of about half a second, since every call takes its memory anew. Progress, Ctrl-C,
-time limits and stops at NaN all live between two chunks; how long a chunk is changes no bit of the answer. A first call
-of no steps compiles, so that the others can be timed.
+A ``Run`` advances in chunks of steps of about half a second, since every call allocates memory again. Progress, Ctrl-C,
+time limits and stops at NaN are handled between two chunks; the length of chunks does not change the result. A first
+call with zero steps compiles, so that the others can be timed.
 
-Memory that runs out on the way and callbacks of the user's that raise leave with what was there before them as
-``.solution``; an exception for memory becomes a ``MemoryError`` that says what was needed and what is free.
+If memory runs out or a callback of the user raises, the exception carries the solution so far as ``.solution``. An
+exception for memory becomes a ``MemoryError`` that reports the needed and the free memory.
 """
 
 import contextlib
@@ -29,21 +29,21 @@ from hjbjax.solution.clock import CHUNK_SECONDS, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
-FIRST_NODES = 20_000  # a first chunk steps over about so many nodes
-CALLBACK = "CpuCallback error"  # how JAX heads the exception of a callback, whatever its type
-# bits, half of which are XLA's own choice: solves take a tenth less time where the processor has AVX-512, sweeps over
-# enumerated controls a quarter less; on others it changes nothing
+FIRST_NODES = 20_000  # number of nodes visited in a first chunk, approximately
+CALLBACK = "CpuCallback error"  # first words of JAX's exception for a callback, whatever its type
+# in bits, twice XLA's default: solves take a tenth less time on processors with AVX-512, sweeps over enumerated
+# controls a quarter less; no effect on others
 WIDTH = {"xla_cpu_prefer_vector_width": 512}
 
-Kept: TypeAlias = tuple[np.ndarray, Grid]  # node values that outlived an exception, and their grid
+Kept: TypeAlias = tuple[np.ndarray, Grid]  # node values saved from an exception, and their grid
 
 
 class WideJit:
-    """``jax.jit`` of a loop of steps at host level, with the widest vectors that a CPU has.
+    """``jax.jit`` for a loop of steps at host level, with the widest vectors of the CPU.
 
     Args:
       function: the loop.
-      options: of ``jax.jit``.
+      options: the options of ``jax.jit``.
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any):
@@ -51,11 +51,11 @@ class WideJit:
         self._jit = functools.partial(jax.jit, function, **options)
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """The loop's answer, compiled at the first call."""
+        """The loop's result; compiles at the first call."""
         return self._jitted(*arguments, **options)
 
     def lower(self, *arguments: Any, **options: Any) -> Any:
-        """The program for such arguments, of which shapes will do, before it is compiled."""
+        """The program for these arguments, or for their shapes, before it is compiled."""
         return self._jitted.lower(*arguments, **options)
 
     @functools.cached_property
@@ -65,7 +65,7 @@ class WideJit:
 
 @functools.cache
 def _known_width() -> dict[str, Any]:
-    """``WIDTH``, or nothing where XLA no longer knows the option."""
+    """``WIDTH``, or no options if XLA does not know it."""
     try:
         jax.jit(lambda: 0, compiler_options=WIDTH)()
     except jax.errors.JaxRuntimeError:
@@ -74,7 +74,7 @@ def _known_width() -> dict[str, Any]:
 
 
 class Run(Part, Protocol):
-    """A computation in steps, as the loop drives it."""
+    """A computation in steps, as used by the loop."""
 
     @property
     def name(self) -> str:
@@ -82,45 +82,45 @@ class Run(Part, Protocol):
 
     @property
     def nodes(self) -> int:
-        """The nodes that a step passes over, by which its pace is told."""
+        """The number of nodes that a step visits, for the pace."""
 
     @property
     def steps(self) -> int:
-        """The steps that are done; a first look at a guess is step 0, and −1 is before it."""
+        """The number of completed steps; 0 after the initial evaluation of a guess, −1 before it."""
 
     @property
     def limit(self) -> float:
-        """No more steps than these; infinite where it ends by itself."""
+        """The largest number of steps; infinite if the run ends on its own."""
 
     @property
     def longest(self) -> int:
-        """The most steps of a chunk."""
+        """The largest number of steps in a chunk."""
 
     @property
     def bar(self) -> dict[str, Any]:
         """The options of its progress bar."""
 
     def compile(self) -> None:
-        """Call the jitted steps for none of them."""
+        """Call the jitted steps with zero steps."""
 
     def first_chunk(self, clock: Clock) -> int:
-        """The number of steps of the first chunk, before any is timed; none is a look alone."""
+        """The number of steps of the first chunk, before any is timed; zero means the initial evaluation only."""
 
     def advance(self, count: int) -> Status:
-        """Take ``count`` steps at most, and say how it stands; returns when they are done."""
+        """Take at most ``count`` steps and return the status; waits until they are done."""
 
     def between(self, status: Status, clock: Clock) -> Status:
-        """Keep what is to be kept between two chunks, and before the first; the status with which to go on."""
+        """Store results between two chunks, and before the first; return the status with which to continue."""
 
     def show(self, bar: Any) -> None:
-        """Move the progress bar."""
+        """Advance the progress bar."""
 
     def keep(self, error: Exception) -> None:
-        """Attach what was there before an exception to it."""
+        """Attach the results before an exception to it."""
 
 
 def drive(run: Run, clock: Clock) -> Status:
-    """Drive a run in chunks of steps until it stops, the steps or the time run out, or Ctrl-C; its last status."""
+    """Drive a run in chunks until it stops, reaches the limit of steps or time, or Ctrl-C; return its last status."""
     status = clock.over()
     if status is not None:
         return status
@@ -145,12 +145,12 @@ def drive(run: Run, clock: Clock) -> Status:
                 clock.phase = f"step {before + 1} on {run.name}"
                 status = run.advance(chunk)
                 clock.count(time.perf_counter() - began, max(run.steps - before, 1), run.nodes)
-                # a short chunk is timed badly, hence the 8
+                # the timing of a short chunk is inaccurate, so the next chunk is at most 8 times as long
                 steps = clock.steps_in(CHUNK_SECONDS, run.nodes)
                 chunk = int(np.clip(steps, 1, min(run.longest, 8 * max(chunk, 1))))
                 if bar is not None:
                     run.show(bar)
-        except KeyboardInterrupt:  # the second one, or by a handler of the user's own
+        except KeyboardInterrupt:  # a second Ctrl-C, or a custom handler
             clock.interrupted = True
             status = run.between(Status.INTERRUPTED, clock)
         except Exception as error:
@@ -163,19 +163,19 @@ def drive(run: Run, clock: Clock) -> Status:
 
 
 def _suggest_cache(clock: Clock) -> None:
-    """Say on the progress line, while a program is compiled, how later processes are spared that."""
+    """On the progress line, while a program is compiled, suggest ``keep_compiled``."""
     if clock.tell is not None and setting("jax_compilation_cache_dir") is None:
         clock.tell(f"{clock.phase} (hjb.keep_compiled() keeps compiled programs for later runs)")
 
 
 def _stop_status(run: Run, clock: Clock) -> Status:
-    """The status that forbids another chunk, else RUNNING; a step that the last pace makes too late is not begun."""
+    """The status that forbids another chunk, else RUNNING; a step that would exceed the time limit is not started."""
     status = clock.over()
-    # one step on a large grid may take minutes, and nothing can cut it
+    # one step on a large grid may take minutes and cannot be interrupted
     if status is None and clock.per_node is not None:
         late = clock.steps_in(clock.seconds - clock.elapsed(), run.nodes) < 1
         status = None if clock.least_of_all(int(not late)) else Status.TIME_LIMIT
-    # the steps that were asked for are done: that comes before a time limit, but not before Ctrl-C
+    # if the requested steps are done this takes precedence over a time limit, but not over Ctrl-C
     if run.steps >= run.limit and status is not Status.INTERRUPTED:
         return Status.MAX_STEPS
     return Status.RUNNING if status is None else status
@@ -196,7 +196,7 @@ def telling(clock: Clock) -> Iterator[None]:
 def progress_bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any]:
     """A progress bar on a terminal, after one second if ``options`` name no other delay; None elsewhere.
 
-    Standard error may be missing, closed or full: then the bar is not shown, and the run does not notice.
+    If standard error is missing, closed or full, the bar is not shown and the run continues.
     """
     if not (progress or (progress is None and streams.is_terminal(sys.stderr))):
         yield None
@@ -211,9 +211,9 @@ def progress_bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any
 
 
 def keep(error: Exception, grid: Grid, *values: Callable[[], Nodes]) -> None:
-    """Attach to an exception the first of some node values that can still be read: a broken run takes its own along."""
+    """Attach to an exception the first of several node values that can still be read after a failure."""
     for value in values:
-        # a buffer that was donated, or that waits for the program that failed, raises when it is read
+        # a donated buffer, or one that depends on the failed program, raises when it is read
         with contextlib.suppress(Exception):
             error.kept = np.asarray(value()), grid  # type: ignore[attr-defined]
             return
@@ -221,12 +221,12 @@ def keep(error: Exception, grid: Grid, *values: Callable[[], Nodes]) -> None:
 
 @contextlib.contextmanager
 def with_solution(clock: Clock, needed: int, partial: Callable[[Kept | None], Solution | None]) -> Iterator[None]:
-    """Let exceptions of the runtime leave with the solution so far.
+    """Attach the solution so far to exceptions of the runtime.
 
     Args:
-      clock: how far the run came.
+      clock: the progress of the run.
       needed: the estimate of its memory, in bytes.
-      partial: from what ``keep`` noted, or None, to the solution so far.
+      partial: a function from the result of ``keep``, or None, to the solution so far.
 
     Raises:
       MemoryError: memory ran out.
@@ -234,16 +234,16 @@ def with_solution(clock: Clock, needed: int, partial: Callable[[Kept | None], So
     try:
         yield
     except Exception as error:
-        # XLA reports memory that ran out by a status in the text, NumPy by the type
+        # XLA reports exhausted memory by a status in the text, NumPy by the type
         starved = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
-        # a refusal of the package's own says all there is to say, and has no value beside it
+        # the package's own errors are complete, and have no value to attach
         if not (starved or isinstance(error, jax.errors.JaxRuntimeError) or CALLBACK in str(error)):
             raise
         solution = getattr(error, "solution", None)
         if solution is None:
-            with contextlib.suppress(MemoryError):  # too little is left even for that
+            with contextlib.suppress(MemoryError):  # there may not be enough memory even for this
                 solution = partial(getattr(error, "kept", None))
-        where = f"It came as far as {clock.phase}; the value so far is .solution of this exception."
+        where = f"It stopped during {clock.phase}; the value so far is .solution of this exception."
         if starved:
             raise _memory_error(error, needed, where, solution) from error
         error.solution = solution  # type: ignore[attr-defined]
@@ -252,12 +252,12 @@ def with_solution(clock: Clock, needed: int, partial: Callable[[Kept | None], So
 
 
 def _memory_error(error: Exception, needed: int, where: str, solution: Solution | None) -> MemoryError:
-    """The report of memory that ran out: what was needed, what is free now, and the solution so far."""
-    # the first line alone: the runtime may append a list of all its buffers
+    """The error for exhausted memory: needed memory, free memory, and the solution so far."""
+    # the first line only: the runtime may append a list of all its buffers
     free, said = memory.available(), (str(error).strip() or type(error).__name__).splitlines()[0][:200]
     left = "" if free is None else f", {free / 1e9:.3g} GB are free now"
     report = MemoryError(
-        f"memory ran out: {said}\nThe run was estimated at {needed / 1e9:.3g} GB{left}. Take fewer nodes or "
+        f"memory ran out: {said}\nThe run was estimated at {needed / 1e9:.3g} GB{left}. Use fewer nodes or "
         f"dtype='float32'; {memory.NO_GRID}.\n{where}"
     )
     report.solution = solution  # type: ignore[attr-defined]
@@ -265,7 +265,7 @@ def _memory_error(error: Exception, needed: int, where: str, solution: Solution 
 
 
 def settings() -> Callable[[], contextlib.AbstractContextManager[None]]:
-    """The context in which another thread has the package's own settings of JAX, and this thread's device."""
+    """A factory of contexts in which another thread uses this thread's JAX settings and device."""
     x64, device = setting("jax_enable_x64"), setting("jax_default_device")
 
     @contextlib.contextmanager
@@ -277,5 +277,5 @@ def settings() -> Callable[[], contextlib.AbstractContextManager[None]]:
 
 
 def setting(name: str) -> Any:
-    """A setting of JAX as this thread has it."""
+    """A setting of JAX in this thread."""
     return getattr(jax.config, name)

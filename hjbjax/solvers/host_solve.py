@@ -1,6 +1,6 @@
 """A stationary solve on the host: checks of nodes, preparation, coarser grids and steps, as the clock allows.
 
-Front doors and JAX transformations take the same path, so that their answers are the same.
+The public functions and JAX transformations share this code, so their results agree.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from hjbjax.solvers.setup import COARSEST, choose_scheme, prepare_on_host, warn_
 
 @dataclasses.dataclass(frozen=True)
 class Choices:
-    """The choices that the caller left to the package.
+    """The choices that the caller left open.
 
     Attributes:
       scheme: the scheme.
@@ -49,9 +49,9 @@ class Choices:
 def solve_on_host(
     on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, choices: Choices
 ) -> Solution:
-    """The solution, with an estimate of the grid's error where the caller left the choice of the scheme.
+    """The solution, with an estimate of the grid error if the caller left the scheme open.
 
-    The arguments are those of ``settled_on_host``.
+    Arguments as for ``settled_on_host``.
     """
     try:
         settled, about = settled_on_host(on, method, tol, guess, clock, choices)
@@ -60,7 +60,7 @@ def solve_on_host(
     if isinstance(settled, Followed):
         return semi_lagrangian.finish_replacement(settled)
     solution = finish(settled, on.grid)
-    # value iteration and tubes, whose targets are nodes, have no estimate
+    # value iteration and tubes, whose targets consist of nodes, have no estimate
     if choices.scheme and settled.task.scheme.subcell and solution.status is Status.CONVERGED:
         solution = with_grid_error(solution, settled, coarser_answer(settled, clock))
     if solution.status is Status.CONVERGED:
@@ -72,29 +72,29 @@ def solve_on_host(
 def settled_on_host(
     on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, choices: Choices
 ) -> tuple[Settled | Followed, dict[str, Any]]:
-    """The end of the iteration, and what there is to say about it.
+    """The end of the iteration, and statistics about it.
 
     Args:
       on: the problem on its grid.
-      method: how it is solved, maybe of nested grids.
+      method: the method, maybe on nested grids.
       tol: as in ``solve``.
-      guess: node values to start from, or None.
+      guess: initial node values, or None.
       clock: the limits.
-      choices: what the caller left to the package.
+      choices: the choices that the caller left open.
 
     Raises:
-      Stopped: the clock said stop before the first step; ``reached`` is the discretisation and the start.
+      Stopped: the clock stopped the solve before the first step; ``reached`` is the discretisation and the start.
     """
     problem, grid = on.problem, on.grid
     start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
-        # from cheap to expensive: all nodes, the ends of the box, and only then what is compiled for the grid
+        # from cheap to expensive: all nodes, the ends of the box, then everything that is compiled for the grid
         node_checks.values(on, clock)
         admissibility.values(problem, grid, on.dtype)
         sharpen = choices.scheme
         if sharpen:
             on = dataclasses.replace(on, scheme=choose_scheme(on, method))
-            sharpen = on.scheme.subcell  # value iteration and tubes start from nowhere else, on a coarser grid neither
+            sharpen = on.scheme.subcell  # value iteration and tubes must start from the chain, also on a coarser grid
         task, assumptions, reach = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
         followed = semi_lagrangian.replace_chain(on, reach, tol, start, clock) if choices.both else None
     except Stopped as stop:

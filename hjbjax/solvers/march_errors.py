@@ -1,12 +1,12 @@
 """Estimates of the errors of a march, from marches on a coarser grid with steps twice as long.
 
-The first coarse march has the ends of the caller. Its difference from V is the error of the spacing and of the step in
-time together, see ``solution.grid_error``. The second one has other ends. Its difference from the first is the error
-of the box, see ``box_error``.
+The first coarse march has the caller's ends. Its difference from V is the discretisation error in space and time, see
+``solution.grid_error``. The second coarse march has other ends. Its difference from the first is the box error, see
+``box_error``.
 
-A step ends at every kept time, and cannot be longer than the time between two of them. Where there are only a few steps
-from one kept time to the next, the coarse marches keep every second time, and the estimate in between is the larger
-one of its two neighbours.
+A step ends at every kept time, so it cannot be longer than the time between two of them. If there are only a few steps
+between kept times, the coarse marches keep every second time, and the estimate in between is the larger one of its two
+neighbours.
 """
 
 import dataclasses
@@ -43,20 +43,20 @@ _stable = jax.jit(time_stepping.stable, static_argnames="tableau")
 
 @jax.jit
 def _fixed(on: Discretisation) -> tuple[jax.Array, jax.Array]:
-    """The fixed nodes and those on the target, bool (*grid) each."""
+    """The fixed nodes and the nodes on the target, bool (*grid) each."""
     found = bellman.obstacles(on)
     return found.fixed, jnp.broadcast_to(found.ended, on.grid.shape)
 
 
 @dataclasses.dataclass(frozen=True)
 class Marched:
-    """A march that came to its end, and what is needed to march again.
+    """A completed march, and the data needed to repeat it.
 
     Args:
       task: its task, on the caller's grid.
-      method: the method as the caller gave it.
+      method: the caller's method.
       start: the caller's V at the horizon, or None.
-      steps: the number of steps that it took.
+      steps: its number of steps.
     """
 
     task: March
@@ -66,13 +66,13 @@ class Marched:
 
 
 class _Coarse(NamedTuple):
-    """A coarser grid and how to march on it, or the reason that there is none for the error of the grid.
+    """A coarser grid and the step lengths for it, or the reason why the grid error has no estimate.
 
     Attributes:
-      on: the problem on the coarser grid; None where there is nothing to march.
-      longer: the steps over those of the finer march.
-      kept: the indices of the kept times that are kept again.
-      reason: of no estimate of the error of the grid; empty where there is one.
+      on: the problem on the coarser grid; None if there is nothing to march.
+      longer: the ratio of the steps to the steps of the finer march.
+      kept: the indices of the kept times that the coarse march keeps.
+      reason: why there is no estimate of the grid error; empty if there is one.
     """
 
     on: Discretisation | None
@@ -82,12 +82,12 @@ class _Coarse(NamedTuple):
 
 
 def with_march_errors(solution: Solution, marched: Marched, clock: Clock) -> Solution:
-    """The solution with ``grid_error`` and ``box_error``, or the reasons that there are none; warns where they matter.
+    """The solution with ``grid_error`` and ``box_error``, or the reasons why there are none; warns if they are large.
 
     Args:
-      solution: of a march that came to its end, at host level.
-      marched: how it was made.
-      clock: the limits; nothing is estimated once they are exceeded.
+      solution: the solution of a completed march, at host level.
+      marched: the march.
+      clock: the limits; there is no estimate once they are exceeded.
     """
     if clock.over() is not None:
         solution.stats["grid_error"] = solution.stats["box_error"] = OVER
@@ -104,7 +104,7 @@ def with_march_errors(solution: Solution, marched: Marched, clock: Clock) -> Sol
 def _with_grid_error(
     solution: Solution, marched: Marched, coarse: _Coarse, found: tuple[np.ndarray | None, np.ndarray, bool]
 ) -> Solution:
-    """The solution with an estimate of the error of the spacing and of the step, from V on the coarser grid."""
+    """The solution with an estimate of the discretisation error in space and time, from V on the coarser grid."""
     first, held, points = found
     if coarse.reason or first is None or coarse.on is None:
         solution.stats["grid_error"] = coarse.reason or UNSETTLED
@@ -125,7 +125,7 @@ def _with_grid_error(
 def _box_error(
     solution: Solution, marched: Marched, coarse: _Coarse, first: np.ndarray | None, clock: Clock
 ) -> BoxError:
-    """The difference between two coarse marches that differ in the ends of the box."""
+    """The difference between two coarse marches with different ends of the box."""
     task, on = marched.task, coarse.on
     others = box_error.other_ends(task.problem, task.grid)
     if others == task.grid.edges:
@@ -148,7 +148,7 @@ def _box_error(
 
 
 def _held(task: March, times: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The fixed nodes at each kept time, bool (k, *grid), or once for all; and true if a target is a point."""
+    """The fixed nodes at each kept time, bool (k, *grid), or once for all, and true if a target is a point."""
     problem, grid = task.problem, task.grid
     if problem.target is None and not grid.prescribed("dirichlet"):
         return np.zeros((1, *grid.shape), bool), False
@@ -159,7 +159,7 @@ def _held(task: March, times: np.ndarray) -> tuple[np.ndarray, bool]:
 
 
 def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
-    """The coarser grid on which the march is made again."""
+    """The coarser grid for the repeated march."""
     task, everything = marched.task, np.arange(len(times))
     grid, others = task.grid, box_error.other_ends(task.problem, task.grid)
     coarse = nested_grids.telling(grid, np.any(held, axis=0))
@@ -182,7 +182,7 @@ def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
 
 
 def _every_second(times: np.ndarray, horizon: float, steps: int) -> np.ndarray:
-    """The indices of the kept times of the coarse march: all, or every second one from the first on."""
+    """The indices of the kept times of the coarse march: all, or every second one starting with the first."""
     count = len(times)
     lengths = np.diff([*times, horizon])
     lengths = lengths[lengths > 0]
@@ -192,7 +192,7 @@ def _every_second(times: np.ndarray, horizon: float, steps: int) -> np.ndarray:
 
 
 def _longer(marched: Marched, times: np.ndarray) -> float:
-    """How much longer steps become: two, and three for a few implicit ones, since two thirds of three is no half."""
+    """The ratio of the steps: two, or three for a few implicit steps, since three steps cannot be halved."""
     horizon = float(marched.task.horizon)
     lengths = np.diff([*times, horizon])
     few = np.min(lengths, where=lengths > 0, initial=horizon) * marched.steps < 3 * FEW * (horizon - times[0])
@@ -202,7 +202,7 @@ def _longer(marched: Marched, times: np.ndarray) -> float:
 def _again(
     marched: Marched, coarse: _Coarse, on: Discretisation, solution: Solution, clock: Clock
 ) -> np.ndarray | None:
-    """V at the times that are kept again, by a march on a coarser grid; None where it does not come to its end."""
+    """V at the times that are kept again, by a march on a coarser grid; None if it does not finish."""
     task, on = marched.task, cast(on, on.dtype)
     start = marched.start
     begin = None if start is None else nested_grids.restrict(np.asarray(start), task.grid, on.grid)
@@ -219,7 +219,7 @@ def _again(
 
 
 def _steps(task: March, longer: float) -> jax.Array:
-    """Steps that are longer by a factor; those that functions of the time made shorter stay, or would miss these."""
+    """Steps longer by a factor; steps that were shortened for functions of time stay, to resolve these."""
     step = jnp.asarray(task.step)
     if step.ndim == 0:
         return longer * step
@@ -227,9 +227,9 @@ def _steps(task: March, longer: float) -> jax.Array:
 
 
 def _limit(task: March, on: Discretisation) -> Number | None:
-    """The longest stable step on a coarser grid; None where it is found before every step.
+    """The longest stable step on a coarser grid; None if it is computed before every step.
 
-    Where all spacings grow by r, the rates Q fall by r at least, and no program needs to be compiled to know it.
+    If all spacings grow by r, the rates Q fall by at least r, so the limit is known without compiling a program.
     """
     if task.limit is None or not task.method.limited or not math.isfinite(float(task.limit)):
         return task.limit
@@ -246,7 +246,7 @@ def _limit(task: March, on: Discretisation) -> Number | None:
 
 
 def _highest(task: March, point: bool) -> float:
-    """The largest order that the error may have: the least of the orders of the scheme and of the method."""
+    """The largest possible order of the error: the smaller of the orders of scheme and method."""
     if point:
         return grid_error.LEAST
     first = task.on.scheme.stages == 1 or len(task.method.tableau.means) == 1
@@ -254,7 +254,7 @@ def _highest(task: March, point: bool) -> float:
 
 
 def _left(marched: Marched, value: np.ndarray) -> float:
-    """What implicit steps leave, and what is missed of functions of the time, cost units."""
+    """The algebraic error of implicit steps, plus the error from fast functions of time, cost units."""
     missed = float(marched.task.missed) * float(np.max(np.abs(value)))
     if marched.task.method.limited:
         return missed

@@ -1,4 +1,4 @@
-"""A march in chunks of steps from one kept time to the next, and the solution that comes of it."""
+"""A march in chunks of steps from one kept time to the next, and its solution."""
 
 import functools
 from typing import Any, TypeAlias
@@ -26,28 +26,28 @@ from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import WideJit
 from hjbjax.solvers.result import isaacs_gap, warn_of_gap
 
-CERTIFICATE = "of a march there is none; halve the spacings and the step to see its error"
+CERTIFICATE = "a march has no certificate; halve the spacings and the step to see its error"
 ADVICE = {
-    Status.DIVERGED: "The value blows up: the worst disturbance reached its bound inside the box. A wider box of "
-    "disturbances tells how fast; where the bound is meant, give inner=0.",
-    Status.NONFINITE: "NaN or infinity appeared in the step after, and the last finite value is kept; check drift "
-    "and costs there, or take a shorter step.",
-    Status.TIME_LIMIT: "The time ran out; raise time_limit, or march on from the value so far with start=.",
-    Status.INTERRUPTED: "It was interrupted and the value so far is kept; march on from it with start=.",
-    Status.STALLED: "The policy iteration of an implicit step did not come to its end; take a shorter step.",
+    Status.DIVERGED: "The value blows up: the worst disturbance reached its bound inside the box. Use a wider box of "
+    "disturbances to see how fast; if the bound is part of the problem, pass inner=0.",
+    Status.NONFINITE: "NaN or infinity appeared in the next step, and the last finite value is kept; check drift "
+    "and costs, or use a shorter step.",
+    Status.TIME_LIMIT: "Reached time_limit; raise it, or continue from the value so far with start=.",
+    Status.INTERRUPTED: "The march was interrupted and the value so far is kept; continue from it with start=.",
+    Status.STALLED: "The policy iteration of an implicit step did not converge; use a shorter step.",
 }
 
-# not donated: a chunk that ends in NaN is done again from the front before it
+# not donated: a chunk that ends in NaN is repeated from the front before it
 _run = WideJit(time_stepping.run)
 _terminal = jax.jit(time_stepping.terminal)
 
-# the players' actions, the nodes on the target, and those at which actions matter
+# the players' actions, the nodes on the target, and the nodes at which actions matter
 Feedback: TypeAlias = tuple[tuple[tuple[Field, ...], tuple[Field, ...]], jax.Array | bool, jax.Array]
 
 
 @jax.jit
 def _greedy(march: March, value: Field, t: Number) -> Feedback:
-    """The players' actions at the time t, the nodes on the target, and those at which actions matter."""
+    """The players' actions at the time t, the nodes on the target, and the nodes at which actions matter."""
     u, d = time_stepping.greedy(march, value, t)
     obstacles = march.obstacles_at(t)
     return (u, d), obstacles.ended, obstacles.acting(value)
@@ -55,11 +55,11 @@ def _greedy(march: March, value: Field, t: Number) -> Feedback:
 
 @jax.jit
 def _gap_at(task: March, value: Field, t: Number) -> tuple[Scalar, Scalar]:
-    """The largest min max − max min of the H that steps solve, and how much the actions matter.
+    """The largest min max − max min of the Hamiltonian of the steps, and the influence of the actions.
 
-    No gap where the players drive components of their own, and where each is upwinded by itself.
+    There is no gap if the players drive separate components, or if each is upwinded separately.
     """
-    # then H is a sum of what each player does, and min max is max min node by node
+    # then H is a sum over the players, and min max equals max min at every node
     if players_of(task.on).decoupled:
         return jnp.zeros(()), jnp.ones(())
     hamiltonian = discrete.around(task.on.at(t), value)
@@ -67,7 +67,7 @@ def _gap_at(task: March, value: Field, t: Number) -> tuple[Scalar, Scalar]:
 
 
 def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
-    """The largest gap over all steps, with a warning where it is large; None without a game, and after a cut."""
+    """The largest gap over all steps, with a warning if it is large; None without a game, and after a cut."""
     if not task.problem.is_game or task.bare or code in CUT:
         return None
     gap, matter = (float(number) for number in front.gap)
@@ -80,7 +80,7 @@ def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
 
 @functools.partial(WideJit, static_argnames="parts")
 def _run_in_parts(march: March, front: Front, until: Number, most: Number, parts: Parts) -> Front:
-    """``time_stepping.run`` on every device of a mesh at once, each with its own nodes."""
+    """``time_stepping.run`` on all devices of a mesh, each with its own nodes."""
 
     def here(march: March, front: Front, until: Number, most: Number) -> Front:
         return time_stepping.run(on_part(march, parts), front, until, most)
@@ -91,7 +91,7 @@ def _run_in_parts(march: March, front: Front, until: Number, most: Number, parts
 
 @functools.partial(jax.jit, static_argnames="parts")
 def _greedy_in_parts(march: March, value: Field, t: Number, parts: Parts) -> Feedback:
-    """``_greedy`` on every device of a mesh at once."""
+    """``_greedy`` on all devices of a mesh."""
 
     def here(march: March, value: Field, t: Number) -> Feedback:
         return _greedy(on_part(march, parts), value, t)
@@ -100,7 +100,7 @@ def _greedy_in_parts(march: March, value: Field, t: Number, parts: Parts) -> Fee
 
 
 def _front_over_nodes(front: Front) -> Front:
-    """The leaves of a front that hold a value at every node, as truth values."""
+    """Mark the leaves of a front that have a value at every node."""
     return altered(jax.tree.map(lambda _: False, front), value=True)
 
 
@@ -115,10 +115,10 @@ class Slices:
         self.value = np.empty((len(kept), *shape), dtype)
         self.policy, self.disturbance = (np.empty((len(kept), *shape, size), dtype) for size in sizes)
         self.cut, self.ends = (np.zeros((len(kept), len(shape), 2), int) for _ in range(2))
-        self.first = len(kept)  # of the filled ones; it counts down, as the march goes backward in time
+        self.first = len(kept)  # index of the first filled slice; decreases, as the march goes backward in time
 
     def keep(self, task: March, value: Nodes, moment: float, answer: Any) -> None:
-        """Fill the next slice; the policy is NaN on the target, and everywhere where there is no ``answer``."""
+        """Fill the next slice; the policy is NaN on the target, and everywhere without an ``answer``."""
         t = np.asarray(moment, self.value.dtype)
         place = self.first - 1
         self.value[place] = value
@@ -130,22 +130,22 @@ class Slices:
             self.cut[place], self.ends[place] = found
             for array, action in ((self.policy, u), (self.disturbance, d)):
                 for j, entry in enumerate(action):
-                    array[place, ..., j] = np.where(ended, np.nan, entry)  # the run is over there: no action
+                    array[place, ..., j] = np.where(ended, np.nan, entry)  # the run has ended there, without an action
         self.times[place] = moment
-        self.first = place  # at last: an interrupt on the way leaves no slice half filled
+        self.first = place  # last, so that an interrupt does not leave a partly filled slice
 
     def saved(self) -> list[np.ndarray]:
-        """The slices that are filled, and their number."""
+        """The filled slices, and their number."""
         filled = slice(self.first, None)
         arrays = (self.times, self.value, self.policy, self.disturbance, self.cut, self.ends)
-        # copies: what is saved must not change when the march goes on
+        # copies: saved data must not change when the march continues
         return [np.array(len(self.times) - self.first), *(array[filled].copy() for array in arrays)]
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Take slices that were saved.
+        """Restore saved slices.
 
         Raises:
-          ValueError: the arrays are not those of as many slices as they say.
+          ValueError: the arrays do not match the number of slices they contain.
         """
         filled, *own = arrays
         check_alike([filled], [np.array(0)])
@@ -158,7 +158,7 @@ class Slices:
             array[self.first :] = entries
 
     def misses(self, t: float) -> bool:
-        """True if the time t, which the march came to, is not among the times that are kept."""
+        """True if the current time t of the march is not among the kept times."""
         return self.first > 0 and (self.first == len(self.times) or t < self.times[self.first])
 
     @property
@@ -170,25 +170,25 @@ class Slices:
 def drive(
     task: March, horizon: float, kept: np.ndarray, start: Nodes | None, clock: Clock
 ) -> tuple[Slices, Front, Status]:
-    """The slices at the kept times, the last front and its status; ends at a code, at the time limit, or at Ctrl-C."""
+    """The slices at the kept times, the last front and its status; ends at a code, the time limit, or Ctrl-C."""
     start = None if start is None else jnp.asarray(start, np.dtype(task.horizon.dtype))
     value, parts = _terminal(task.on.at(task.horizon), start), task.on.parts
     front = time_stepping.begin(task, value, horizon - kept[-1])
     finite = bool(jnp.all(jnp.isfinite(front.value)))
     run = MarchRun(task, front, kept) if parts is None else MarchInParts(task, front, kept, parts)
-    del front, value  # or they would hold on to the value at the horizon, which the first steps leave behind
+    del front, value  # free the value at the horizon, which is not needed after the first steps
     status = host_loop.drive(run, clock) if finite else Status.NONFINITE
     slices, front = run.slices, run.gathered()
-    # after a cut nothing is compiled, and the feedback has its program only if a slice was kept before
+    # after a cut nothing is compiled, and the program of the feedback exists only if a slice was kept before
     if status is not Status.CONVERGED and slices.misses(run.time) and bool(jnp.all(jnp.isfinite(front.value))):
-        run.store(feedback=status not in CUT or slices.first < len(kept))  # how far it came
+        run.store(feedback=status not in CUT or slices.first < len(kept))  # the last time reached
     return slices, front, status
 
 
 class MarchRun:
-    """A march from one kept time to the next: its front, and the slices that are kept so far."""
+    """A march from one kept time to the next: its front, and the slices kept so far."""
 
-    limit, longest = np.inf, 10**9  # of steps: none
+    limit, longest = np.inf, 10**9  # of steps: unlimited
     passing = False
     _run, _greedy = staticmethod(_run), staticmethod(_greedy)
 
@@ -200,12 +200,12 @@ class MarchRun:
 
     @property
     def steps(self) -> int:
-        """The steps that are done."""
+        """The number of completed steps."""
         return int(self.front.steps)
 
     @property
     def time(self) -> float:
-        """The time that the march has come to."""
+        """The current time of the march."""
         if self._is_kept:
             return float(self.slices.times[self.slices.first])
         left, rest = (float(number) for number in self.front.left)
@@ -213,37 +213,37 @@ class MarchRun:
 
     @property
     def until(self) -> Scalar:
-        """The kept time that comes next, in the type of the values."""
+        """The next kept time, in the dtype of the values."""
         return jnp.asarray(self.slices.times[self.slices.first - 1], np.dtype(self.task.horizon.dtype))
 
     def compile(self) -> None:
-        """Run no step."""
+        """Call the program with zero steps."""
         jax.block_until_ready(self._run(self.task, self.front, jnp.zeros_like(self.until), 0))
 
     def first_chunk(self, clock: Clock) -> int:
-        """One step: none is timed."""
+        """One step, since none has been timed."""
         return 1
 
     def advance(self, count: int) -> Status:
-        """Take ``count`` steps at most towards the next kept time.
+        """Take at most ``count`` steps towards the next kept time.
 
-        A chunk that ends in numbers that are not finite is taken back to the last step before.
+        A chunk that ends in values that are not finite is undone back to the last finite step.
         """
         after = jax.block_until_ready(self._run(self.task, self.front, self.until, count))
         status = Status(int(after.code))
         if status is Status.NONFINITE:
-            # the steps are the same ones, so that it ends just before the last
+            # the steps are identical, so the chunk ends just before the bad one
             after = self._run(self.task, self.front, self.until, int(after.steps) - self.steps - 1)
         self.front = after
         return status
 
     def between(self, status: Status, clock: Clock) -> Status:
-        """Keep the slices at the times that the front has reached; CONVERGED after the last of them."""
+        """Store the slices at the times that the front has reached; CONVERGED after the last of them."""
         slices = self.slices
         while status is Status.RUNNING and slices.first > 0 and float(self.front.left[0]) <= 0:
             if not self._is_kept:
                 cut = clock.over()
-                # at the last kept time nothing is missing any more, so a time limit that passes now takes nothing away
+                # at the last kept time the march is complete, so a time limit that passes now is ignored
                 if cut is not None and not (slices.first == 1 and cut is Status.TIME_LIMIT):
                     return cut
                 self.store()
@@ -253,7 +253,7 @@ class MarchRun:
 
     @property
     def _is_kept(self) -> bool:
-        """True if the front is at the last slice: an interrupt can come before its clock is set for the next one."""
+        """True if the front is at the last slice, because an interrupt came before its clock was reset."""
         times, first = self.slices.times, self.slices.first
         at_end = float(self.front.left[0]) <= 0 and first < len(times)
         return at_end and self.slices.value.dtype.type(times[first]) == np.asarray(self.front.t)
@@ -267,7 +267,7 @@ class MarchRun:
         return self.front
 
     def store(self, *, feedback: bool = True) -> None:
-        """Keep the value at the front, and its feedback, as the next slice."""
+        """Store the value at the front, and its feedback, as the next slice."""
         # one program for all kept times: the time is an argument
         asked = feedback and not self.task.bare
         answer = jax.device_get(self._greedy(self.task, self.front.value, self.front.t)) if asked else None
@@ -275,17 +275,17 @@ class MarchRun:
         self._keep_cut(self.front)
 
     def _keep_cut(self, front: Front) -> None:
-        """Take what was cut off since the kept time before, where that is more, and count anew."""
+        """Record the counts of cut-off drift since the previous kept time, if larger, and reset them."""
         place = self.slices.first
         np.maximum(self.slices.cut[place], np.asarray(front.cut), out=self.slices.cut[place])
         self.front = altered(self.front, cut=jnp.zeros_like(front.cut))
 
     def saved(self) -> list[Any]:
-        """The slices that are kept, and the front."""
+        """The stored slices, and the front."""
         return [*self.slices.saved(), *jax.tree.leaves(self.gathered())]
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from a front that was saved.
+        """Continue from a saved front.
 
         Raises:
           ValueError: the arrays are not a front of this march and its slices.
@@ -293,7 +293,7 @@ class MarchRun:
         count = len(self.slices.saved())
         check_alike(arrays[count:], jax.tree.leaves(self.gathered()))
         front = jax.tree.unflatten(jax.tree.structure(self.front), map(jnp.asarray, arrays[count:]))
-        # with NaN in either the march would never come to its end
+        # with NaN in either the march would never end
         if not (0 <= front.t <= self.task.horizon and np.all(np.isfinite(front.left))):
             raise ValueError(
                 f"its time is {front.t}, wanted one in [0, {self.task.horizon}], and {front.left} are left"
@@ -303,21 +303,21 @@ class MarchRun:
         self.front = front
 
     def show(self, bar: Any) -> None:
-        """Move the progress bar, which runs over the problem's own time."""
+        """Advance the progress bar, which shows the problem's own time."""
         bar.update(float(self.task.horizon) - self.time - bar.n)
         bar.set_postfix_str(f"{self.steps} steps", refresh=False)
 
     def keep(self, error: Exception) -> None:
         """Attach the solution so far to an exception."""
         if self.slices.misses(self.time):
-            # without a feedback: its program calls the function that raised once more
+            # without a feedback, whose program would call the failed function again
             self.store(feedback=False)
         solution = assemble(self.task, self.task.grid, self.slices, self.gathered(), Status.INTERRUPTED)
         error.solution = solution  # type: ignore[attr-defined]
 
 
 class MarchInParts(MarchRun):
-    """A march whose nodes are divided over many devices."""
+    """A march whose nodes are divided among several devices."""
 
     def __init__(self, task: March, front: Front, kept: np.ndarray, parts: Parts):
         super().__init__(task, front, kept)
@@ -334,7 +334,7 @@ class MarchInParts(MarchRun):
         return self.parts.gathered(self.front, self._over)
 
     def store(self, *, feedback: bool = True) -> None:
-        """Keep the value at the front, and its feedback, as the next slice."""
+        """Store the value at the front, and its feedback, as the next slice."""
         front, answer = self.gathered(), None
         if feedback and not self.task.bare:
             answer = _greedy_in_parts(self._divided, self.front.value, self.front.t, self.parts)
@@ -342,18 +342,18 @@ class MarchInParts(MarchRun):
         self.slices.keep(self.task, front.value, self.time, answer)
 
     def keep(self, error: Exception) -> None:
-        """Attach the solution so far to an exception; what other processes hold is out of reach."""
+        """Attach the solution so far to an exception; data in other processes is inaccessible."""
         if not spans_processes(self.parts.mesh):
             super().keep(error)
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from a front that was saved, by whatever number of devices."""
+        """Continue from a saved front, on any number of devices."""
         super().restore(arrays)
         self.front = self.parts.spread(self.front, self._over)
 
 
 def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status) -> Solution:
-    """The solution of a march on the user's ``grid``: its slices, and how it went."""
+    """The solution of a march on the user's ``grid``, from its slices and its outcome."""
     problem = task.problem
     kept = slice(slices.first, None)
     return Solution(
@@ -380,13 +380,13 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
 
 
 def _message(task: March, front: Front, code: Status) -> str:
-    """The sentence that says how far a march came, and what to do about it."""
+    """The message with the time that a march reached, and a remedy."""
     t, horizon = float(front.t), float(task.horizon)
     if code is Status.CONVERGED:
         return f"Marched from t = {horizon:g} to t = {t:g}."
     what = ADVICE.get(code, code.message)
-    # a march stalls for one of three reasons, and what to do differs: noise without a chain, rates without a bound,
-    # or a policy iteration that did not end, as ADVICE has it
+    # a march stalls for one of three reasons with different remedies: noise without a chain, unbounded rates, or a
+    # policy iteration that did not converge, which ADVICE covers
     if code is Status.STALLED and int(front.seen.lacking) >= 0:
         what = _noise_message(task, front)
     elif code is Status.STALLED and task.method.limited:
@@ -395,7 +395,7 @@ def _message(task: March, front: Front, code: Status) -> str:
 
 
 def _noise_message(task: March, front: Front) -> str:
-    """The message on noise that is correlated more than the spacings allow: where, when, and what would do."""
+    """The message for noise that is correlated more than the spacings allow: place, time, and remedy."""
     grid, t = task.grid, front.seen.t
     index = tuple(int(i) for i in np.unravel_index(int(front.seen.lacking), grid.shape))
     players, *_ = jax.device_get(_greedy(task, front.value, t))

@@ -1,4 +1,4 @@
-"""The tasks of schemes of high order, and how they share a program with the task of their chain."""
+"""The tasks of high-order schemes, which can share a program with the task of their chain."""
 
 import dataclasses
 
@@ -10,11 +10,11 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.solvers.setup import Assumptions
 
-AHEAD = 2.0  # a corrective step in time lasts one over this of the time that crossing the box takes
+AHEAD = 2.0  # the time to cross the box, over the length of a corrective time step
 
 
 def staged(task: Task, scheme: Scheme) -> Task:
-    """The task of the chain, in the program of the scheme where both can share one: without noise, certified."""
+    """The task of the chain, in the program of the scheme if both can share one: without noise, certified."""
     fits = task.problem.noise is None and min(task.grid.shape) >= scheme.points
     certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
     if scheme.monotone or not (fits and certified):
@@ -23,19 +23,19 @@ def staged(task: Task, scheme: Scheme) -> Task:
 
 
 def at_order(task: Task, *, first: bool) -> Task:
-    """The task of a scheme of high order, or of its chain (``first``) in the same program: only numbers differ."""
+    """The task of a high-order scheme, or of its chain (``first``) in the same program: only numbers differ."""
     return dataclasses.replace(sharpened(task, first=first), first_order=np.asarray(first))
 
 
 def sharpened(task: Task, *, first: bool = False) -> Task:
-    """The task with what slopes of high order need for their iteration, and their chain (``first``) does not.
+    """The task with additions for the iteration with high-order slopes, which their chain (``first``) does not use.
 
     Without a discount these slopes have false solutions, because the artificial diffusion with which upwinding reaches
-    rest nodes is missing. Where the slopes overshoot, a policy circles a rest node and pays nothing, or less than that:
-    V + c with c < 0 then solves the equation at all nodes except the rest node and its neighbours. A floor prevents
-    that: it is zero where costs are not negative, and V is small next to a rest node. Corrections overshoot as well,
-    since their error is carried along a whole path, so each is an implicit step in time of length 1/κ, half of what
-    crossing the box takes. With noise errors are not carried far, and whole corrections need fewer steps.
+    rest nodes is missing. If the slopes overshoot, a policy circles a rest node at zero or negative cost: V + c with c
+    < 0 then solves the equation at all nodes except the rest node and its neighbours. A floor prevents this: it is zero
+    where costs are non-negative, and V is small next to a rest node. Corrections overshoot as well, since their error
+    is carried along a whole path, so each is an implicit time step of length 1/κ, half the time to cross the box. With
+    noise errors are not carried far, and whole corrections need fewer steps.
     """
     obstacles, shift = task.obstacles, None
     if task.floor is not None:
@@ -47,7 +47,7 @@ def sharpened(task: Task, *, first: bool = False) -> Task:
 
 
 def raised(task: Task, assumptions: Assumptions, scheme: Scheme) -> tuple[Task, Assumptions]:
-    """The task and the assumptions of a scheme of high order, which has no certificate, from those of its chain."""
+    """The task and the assumptions of a high-order scheme, which has no certificate, from those of its chain."""
     # defect correction: the matrix of the chain, the residual of the better slopes
     on = dataclasses.replace(task.on, scheme=scheme)
     task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=on, first_order=None)

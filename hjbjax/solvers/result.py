@@ -1,4 +1,4 @@
-"""From a state of the iteration to a Solution: NumPy arrays, masks, the Isaacs gap, the message."""
+"""Construction of a Solution from the last state: NumPy arrays, masks, the Isaacs gap, the message."""
 
 import dataclasses
 import functools
@@ -29,28 +29,28 @@ from hjbjax.solvers.coarser_answer import CoarserAnswer
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
 
-GAP = 0.05  # of what the actions matter; where Isaacs' condition holds, upwinding left up to .019 on 21 nodes
-COARSE = 0.1  # of the range of V: a larger error of the grid is worth a warning ...
-NODES = 0.05  # ... at more than this share of the nodes
-FLAT = 1e-3  # of max |V|: a smaller range is no scale for errors
-MOST = 2 / 3  # of an end's nodes: whatever has a velocity leaves by half of those where its position ends
+GAP = 0.05  # relative to the actions' influence; if Isaacs' condition holds, upwinding left 0.019 on 21 nodes
+COARSE = 0.1  # fraction of the range of V: a larger grid error is worth a warning ...
+NODES = 0.05  # ... at more than this fraction of the nodes
+FLAT = 1e-3  # fraction of max |V|: a smaller range is not a scale for errors
+MOST = 2 / 3  # fraction of an end's nodes; at the end of a position, its velocity points outwards at half of them
 
 
 def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
-    """The solution in NumPy, with infinite values where the target cannot be reached and no policy where none is.
+    """The solution in NumPy, infinite where the target cannot be reached, without a policy where there is none.
 
-    The Isaacs gap is a program of its own, and nothing is compiled after a ``cut``.
+    The Isaacs gap has its own program, and nothing is compiled after a ``cut``.
     """
     task, assumptions, reached, state, code, residuals, origin, note = settled
     stopped = cut or code in CUT
-    mute = stopped or task.bare  # nothing is known of the actions
+    mute = stopped or task.bare  # the actions are unknown
     if not mute:
         _refuse_noise(task, state, grid)
-    # V falls by the same amount a step for ever, which neither the residual nor the number of steps can tell
+    # V falls by the same amount in every step, which neither the residual nor the number of steps reveals
     earning = None if mute else earnings.earned(task, state)
     code = code if earning is None else Status.DIVERGED
     gap = None if mute else _isaacs_gap(task, state)
-    unanswered = mute or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift to speak of
+    unanswered = mute or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift
     leaving = None if unanswered else _leaving(task, state)
     if not mute and code is Status.CONVERGED:
         warn_of_no_arrival(task, state)
@@ -59,10 +59,10 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     solution = assemble(task, state, assumptions)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
-    # what the device hands over may be read-only
+    # arrays from the device may be read-only
     arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
-    arrays["value"][lost] = np.inf  # until here they held a finite number above all others
-    idle = lost | np.asarray(task.obstacles.ended) | (int(state.step) < 0)  # nobody looked for a policy yet
+    arrays["value"][lost] = np.inf  # they stored a finite number above all others
+    idle = lost | np.asarray(task.obstacles.ended) | (int(state.step) < 0)  # no policy has been computed yet
     for array in (arrays["policy"], arrays["disturbance"]):
         if array is not None:
             array[idle] = np.nan
@@ -91,21 +91,21 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
 
 
 def _certified(settled: Settled) -> float | None:
-    """The certified bound on the error of a monotone answer, or None."""
+    """The certified error bound of a monotone solution, or None."""
     error = assemble(settled.task, jax.device_get(settled.state), settled.assumptions).error
     return None if error is None else float(error)
 
 
 def _apart(state: State, origin: Settled) -> float:
-    """The largest change from the monotone answer to the one of second order, cost units."""
+    """The largest change from the monotone to the second-order solution, cost units."""
     counted = np.asarray(origin.task.counted)
     return float(np.max(np.abs(np.asarray(state.value) - np.asarray(origin.state.value))[counted], initial=0))
 
 
 def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer) -> Solution:
-    """The solution with an estimate of its distance to the exact value, and a warning where that is large.
+    """The solution with an estimate of its distance to the exact value, and a warning if this is large.
 
-    Without an answer on a coarser grid ``stats["grid_error"]`` has the reason instead.
+    Without a solution on a coarser grid ``stats["grid_error"]`` has the reason instead.
     """
     if coarser.grid is None or coarser.value is None:
         solution.stats["grid_error"] = coarser.reason
@@ -126,12 +126,12 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer
 
 
 def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> None:
-    """Warn of a grid whose estimated error is above a tenth of the range of V at many nodes at some time.
+    """Warn if the estimated error is above a tenth of the range of V at many nodes at some time.
 
     Args:
-      error: the estimate, (k, *grid), with k = 1 for a stationary answer.
+      error: the estimate, (k, *grid), with k = 1 for a stationary solution.
       value: V, (k, *grid); infinite values do not count.
-      more: the things of which more reduce the error.
+      more: the quantities to increase for a smaller error.
     """
     finite = np.isfinite(value)
     if not finite.any():
@@ -142,29 +142,29 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
     if share > NODES:
         warn(
             f"the grid is coarse for this problem: its error is above a tenth of the range of V at {share:.0%} of the "
-            f"nodes (Solution.grid_error). Take more {more}, or gather nodes where V bends: Grid(..., stretch=)"
+            f"nodes (Solution.grid_error). Use more {more}, or concentrate nodes where V bends: Grid(..., stretch=)"
         )
 
 
 def _highest(settled: Settled) -> float:
-    """The largest order that the error may have: that of the scheme, less from a target that no cell resolves."""
+    """The largest possible order of the error: the scheme's, or lower for a target smaller than a cell."""
     if grid_error.is_a_point(np.asarray(settled.task.obstacles.ended)):
         return grid_error.LEAST
     return grid_error.FIRST if settled.note else grid_error.SECOND
 
 
 def _left(solution: Solution, settled: Settled) -> float:
-    """The distance to the discrete solution that the iteration left, cost units."""
+    """The algebraic error of the iteration, cost units."""
     error = solution.error
     known = float(settled.state.best[0]) if error is None else float(error)
     return min(known, float(settled.task.tol))
 
 
 def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solution:
-    """The solution of a run that ended before its first step: the value it was to start from, and no policy."""
+    """The solution of a run that ended before its first step: its initial value, without a policy."""
     problem, value = on.problem, np.asarray(value, on.dtype)
     inputs = [0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances)]
-    nan = np.array(np.nan, value.dtype)  # one number seen everywhere: on 85 million nodes an array of it takes seconds
+    nan = np.array(np.nan, value.dtype)  # a broadcast scalar: for 85 million nodes filling an array takes seconds
     policy, disturbance = (np.broadcast_to(nan, (*value.shape, m)) for m in inputs)
     return Solution(
         on.grid, value, policy, disturbance if problem.is_game else None, code=code,
@@ -174,24 +174,24 @@ def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solutio
             "scheme": repr(on.scheme),
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(value.dtype),
-            "certificate": "the value was not looked at",
+            "certificate": "the value was not evaluated",
             "versions": {"jax": jax.__version__, "numpy": np.__version__},
         },
     )  # fmt: skip
 
 
 def with_last_phase(solution: Solution, clock: Clock) -> Solution:
-    """The solution with how far its run came, where that was cut short; no Ctrl-C is lost, even a late one."""
+    """The solution with the phase in which its run was cut short; also records a late Ctrl-C."""
     if clock.interrupted and solution.status is Status.CONVERGED:
-        message = f"It was interrupted after it had come to its end, and nothing is missing. {solution.message}"
+        message = f"It was interrupted after it had finished; the result is complete. {solution.message}"
         return dataclasses.replace(solution, code=int(Status.INTERRUPTED), message=message)
     if solution.status not in CUT:
         return solution
-    return dataclasses.replace(solution, message=f"{solution.message} It came as far as {clock.phase}.")
+    return dataclasses.replace(solution, message=f"{solution.message} It stopped during {clock.phase}.")
 
 
 def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
-    """The solution of a state, without what only the host finds out; pure, so that it may be traced."""
+    """The solution for a state, without the parts that require the host; pure, so that it may be traced."""
     problem = task.problem
     controls, disturbances = state.policy.controls, state.policy.disturbances
     xp: Any = jnp if is_traced(state) else np
@@ -209,11 +209,11 @@ def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
 
 
 def _enclosure(task: Task, state: State, assumptions: Assumptions) -> Any:
-    """The bounds on V_h, with what is missed of optima; None where these are searched, and without a certificate."""
+    """The bounds on V_h, including errors of the optima; None if these are searched, and without a certificate."""
     kind, bound, discount = assumptions.certificate, state.bound, task.problem.discount
     if kind not in BOUNDING or not assumptions.exact:
         return None
-    traced = is_traced(state)  # the host knows before a solve whether costs are convex where they must be
+    traced = is_traced(state)  # before a solve, the host has checked that costs are convex where they must be
     if any(each.programmed for each in players_of(task.on).both) or (traced and exact.needs_convexity(task.on)):
         bound = _widened(task, state.value, bound, kind)
         bound = bound if traced else jax.device_get(bound)
@@ -222,7 +222,7 @@ def _enclosure(task: Task, state: State, assumptions: Assumptions) -> Any:
 
 @functools.partial(jax.jit, static_argnames="kind")
 def _widened(task: Task, value: Field, bound: ErrorBound, kind: Certificate) -> ErrorBound:
-    """The bounds with what is missed of optima where V is not given; endless where costs are not convex."""
+    """The bounds widened by the errors of the optima at free nodes; infinite where costs are not convex."""
     free, lost = task.counted & ~task.given.fixed, exact.may_miss(task.on)
     control, disturbance = (
         jnp.where(free, jnp.where(lost, jnp.inf, each), 0)
@@ -233,29 +233,29 @@ def _widened(task: Task, value: Field, bound: ErrorBound, kind: Certificate) -> 
 
 
 def _leaving(task: Task, state: State) -> np.ndarray:
-    """Numbers of nodes at which the optimal drift is cut off, (n, 2)."""
+    """The number of nodes at which the optimal drift is cut off, (n, 2)."""
     value, policy, obstacles, counted = jax.device_get((state.value, state.policy, task.obstacles, task.counted))
     u, d = (list(players) for players in (policy.controls, policy.disturbances))
     return edges.cut(task.problem, task.grid, value, (u, d), counted & obstacles.acting(value))[0]
 
 
 def warn_of_cuts(cut: np.ndarray, ends: np.ndarray, grid: Grid) -> None:
-    """Warn of ends at more than ``MOST`` of whose nodes the optimal drift is cut off; both shape (n, 2)."""
+    """Warn of ends at more than ``MOST`` of whose nodes the optimal drift is cut off; both arrays (n, 2)."""
     most = [
         f"the {('lower', 'upper')[side]} end of {grid.names[axis]} ({cut[axis, side]} of {ends[axis, side]} nodes)"
         for axis, side in np.argwhere(cut > MOST * ends)
     ]
     if most:
         warn(
-            f"the optimal drift leaves the box and is cut off at {', '.join(most)}, as if a wall stood there on which "
-            "to lean is free: near such an end the value is not that of your problem. Choose the box larger, or "
+            f"the optimal drift leaves the box and is cut off at {', '.join(most)}, as if there were a wall. "
+            "Near this boundary the value does not solve your problem. Use a larger box, or "
             "Grid(..., edges='constrained') or 'open'"
         )
 
 
 @jax.jit
 def _lacking(task: Task, controls: tuple, disturbances: tuple) -> jax.Array:
-    """The first node, counted flat, where the policy's noise is correlated more than the spacings allow, or −1."""
+    """The flat index of the first node where the policy's noise is correlated more than the spacings allow, or −1."""
     lacking = correlated_noise.lacking(task.on, task.on.diffusion(list(controls), list(disturbances)))
     if lacking is None:
         return jnp.full((), -1)
@@ -264,11 +264,11 @@ def _lacking(task: Task, controls: tuple, disturbances: tuple) -> jax.Array:
 
 
 def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
-    """Refuse noise that depends on the action where the one found lies between those that were tried before."""
+    """Refuse noise of the found action that has no chain, although the samples checked before had one."""
     if not callable(task.problem.noise) or not players_of(task.on).steers_noise:
         return
     policy = state.policy
-    # the checks before a solve look at samples of the actions, and the exact minimum lies between them
+    # the checks before a solve use samples of the actions; the exact minimum may lie between them
     first = int(_lacking(task, policy.controls, policy.disturbances))
     if first < 0:
         return
@@ -287,24 +287,24 @@ def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
 
 
 def warn_of_gap(gap: float, matter: float, isaacs: str) -> None:
-    """Warn of a gap that is no small part of what the actions matter; upwinding leaves one of the order of h."""
+    """Warn of a gap that is large relative to the influence of the actions; upwinding causes a gap of order h."""
     if gap > GAP * matter:
         warn(
             f"the Isaacs condition fails: min max and max min of the Hamiltonian differ by up to {gap:.3g} per unit "
-            f"time, {gap / matter:.0%} of what the actions matter; the value is the {isaacs} one, isaacs= gives the "
-            "other"
+            f"time, {gap / matter:.0%} of the influence of the actions; the value is the {isaacs} one, isaacs= selects "
+            "the other"
         )
 
 
 @jax.jit
 def _gap_at(task: Task, value: Field) -> tuple[Scalar, Scalar]:
-    """The Isaacs gap of a stationary game at V, and how much the actions matter, where V is not given."""
+    """The Isaacs gap of a stationary game at V, and the influence of the actions, at free nodes."""
     hamiltonian = discrete.around(task.on, value, task.lost)
     return isaacs_gap(hamiltonian, task.counted & ~task.obstacles.fixed)
 
 
 def _isaacs_gap(task: Task, state: State) -> float | None:
-    """The gap at the last state, with a warning where it is large; None without a game."""
+    """The gap at the last state, with a warning if it is large; None without a game."""
     if not task.problem.is_game:
         return None
     gap, matter = (float(number) for number in _gap_at(task, state.value))
@@ -313,12 +313,12 @@ def _isaacs_gap(task: Task, state: State) -> float | None:
 
 
 def _unbounded_message(earning: earnings.Earning, grid: Grid) -> str:
-    """The message of a value that is −∞, with a place where a policy earns for ever."""
+    """The message for a value of −∞, with a place where a policy earns indefinitely."""
     state = ", ".join(f"{x:.4g}" for x in grid.state(earning.node))
     return (
-        f"The value is −∞: without discount, a policy can stay for ever where it pays {earning.mean:.3g} a unit time "
-        f"on the average, near x = ({state}) for one. Give discount > 0, a horizon (march), or a running cost that is "
-        "not negative there."
+        f"The value is −∞: without discount, a policy can stay indefinitely where its mean cost is {earning.mean:.3g} "
+        f"per unit time, for example near x = ({state}). Add a discount > 0, a horizon (march), or a running cost that "
+        "is not negative there."
     )
 
 
@@ -326,8 +326,8 @@ _broken = jax.jit(fixed_point.broken)
 
 
 def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
-    """The message on NaN or infinity, with the place, found by taking the step once more that brought it."""
-    # the state holds the last finite value, so that nothing in it shows where the infinity began
+    """The message for NaN or infinity, with the place, found by repeating the step that caused it."""
+    # the state holds the last finite value, which does not show where the fault began
     bad = np.asarray(_broken(task, state))
     step = int(state.step)
     when = "at the guess" if step == 0 else f"in step {step}"
@@ -335,8 +335,8 @@ def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
     discount, left = float(np.asarray(task.problem.discount)), float(np.max(np.abs(state.policy.defect)))
     if 0 < discount < 1 and left > discount * float(np.finfo(np.float32).max):  # sweeps run in single precision
         return (
-            f"Infinity appeared {when} and {kept}: discount = {discount:.3g} is so small that what is left, "
-            f"{left:.3g} a unit time, divided by it is no number; give a larger one, or 0 and a target."
+            f"Infinity appeared {when} and {kept}: discount = {discount:.3g} is so small that the remaining residual, "
+            f"{left:.3g} per unit time, divided by it overflows; use a larger discount, or 0 and a target."
         )
     if not np.any(bad):
         return f"NaN or infinity appeared {when} and {kept}; check drift and cost."
@@ -349,23 +349,23 @@ def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
 
 
 def within_reach(best: float) -> str:
-    """The sentence on a certified solve that stalled, by its smallest error."""
+    """The sentence for a certified solve that stalled, with a tolerance that is within reach."""
     return f"{Status.STALLED.message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
 
 
 def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
-    """The sentence that says how a solve ended, and what to do about it."""
+    """The sentence with the outcome of a solve and a remedy."""
     if code is Status.NONFINITE:
         return _not_finite_message(task, state, grid)
-    # the three certificates that bound no error cannot promise that a smaller tolerance is within reach
+    # the certificates that do not bound the error cannot promise that a smaller tolerance is within reach
     best, tol = float(state.best[0]), float(task.tol)
     certified = task.certificate not in (Certificate.NONE, Certificate.RESIDUAL, Certificate.OPEN)
     if code is Status.STALLED and np.isfinite(best) and certified:
         return within_reach(best)
     if code is Status.STALLED and np.isfinite(best):
         return (
-            f"Residual and last step stopped falling at {best:.2g}, above the tolerance, and no certificate says how "
-            "far off the value is; give a discount, some noise or a better guess, or compute in float64."
+            f"Residual and last step stopped decreasing at {best:.2g}, above the tolerance, and no certificate bounds "
+            "the error; add a discount, some noise or a better guess, or compute in float64."
         )
     if code is Status.CONVERGED and task.certificate is Certificate.NONE and task.constrained:
         return "The value no longer changes, up to rounding; no certificate bounds the error."

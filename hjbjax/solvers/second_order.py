@@ -1,4 +1,4 @@
-"""From the monotone answer to the second-order one, and the choice between the two."""
+"""The step from the monotone to the second-order solution, and the choice between the two."""
 
 import numpy as np
 
@@ -12,13 +12,13 @@ from hjbjax.solvers.order import raised
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.stationary_run import iterate
 
-LITTLE = 0.1  # of the range of V: the second order may change V by so much without being questioned
+LITTLE = 0.1  # fraction of the range of V by which the second order may change V without further checks
 
 
 def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
-    """The answer by a scheme of high order, from the monotone one, which it keeps as its ``origin``.
+    """The solution by a high-order scheme, started from the monotone one, which it keeps as its ``origin``.
 
-    If the clock stops it before its first look, the monotone answer stands, with the status of the stop.
+    If the clock stops it before its initial evaluation, the monotone solution is returned with the status of the stop.
     """
     over = clock.over()
     if over is not None:
@@ -32,10 +32,10 @@ def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
 
 
 def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) -> Settled:
-    """The second-order answer, or, if the caller left the choice (``sharpen``), possibly the monotone one with a note.
+    """The second-order solution, or, if the caller left the choice (``sharpen``), the monotone one with a note.
 
-    The monotone answer stands if the second-order iteration did not converge, or if it moved V further than the error
-    of the grid explains.
+    The monotone solution is returned if the second-order iteration did not converge, or if it moved V further than the
+    error of the grid explains.
     """
     if not sharpen:
         return sharp
@@ -49,10 +49,10 @@ def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) 
 
 
 def _contradiction(settled: Settled, sharp: Settled, clock: Clock) -> str | None:
-    """The note on a second-order answer that contradicts the certified monotone one; None if it does not.
+    """The note on a second-order solution that contradicts the certified monotone one; None if it does not.
 
-    The error of the monotone answer is its change from the next coarser grid over 2^q − 1, with the least order q = ½.
-    Nothing is computed where the second order changed little.
+    The error of the monotone solution is its change from the next coarser grid over 2^q − 1, with the least order q =
+    ½. Nothing is computed if the second order changed little.
     """
     before, after = finite(settled.task, settled.state), finite(sharp.task, sharp.state)
     moved = float(np.max(nested_grids.apart(before, after)))

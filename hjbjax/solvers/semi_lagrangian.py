@@ -1,4 +1,4 @@
-"""``solve`` by a scheme that follows paths: its refusals, its task, its run in chunks of steps, its solution."""
+"""``solve`` by a scheme that follows paths: its checks, its task, its run in chunks of steps, its solution."""
 
 import dataclasses
 import functools
@@ -36,10 +36,10 @@ from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
 from hjbjax.solvers.setup import check_on_one_state, is_carried_past, warn_unreached
 from hjbjax.solvers.stationary_run import StatesInChunks
 
-REPLACEMENT = SemiLagrangian()  # of the chain, where that is carried past the target
+REPLACEMENT = SemiLagrangian()  # replaces the chain if this is carried past the target
 REASON = (
     "It was solved by SemiLagrangian(): the Markov chain of Upwind() and Limited() spreads by about a cell per step "
-    "and may be carried past the target, so its expected cost is infinite where that of the path is finite."
+    "and may be carried past the target, so its expected cost is infinite where the cost of the path is finite."
 )
 FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 WORDS = {
@@ -49,27 +49,27 @@ WORDS = {
 
 
 def relaxations(method: Method | None, n: int) -> int:
-    """How often a step follows the best arcs, in n dimensions.
+    """The number of times that a step follows the best arcs, in n dimensions.
 
     Raises:
-      ValueError: a method that solves the equation of a policy by the matrix of a chain, or on coarser grids.
+      ValueError: the method uses the matrix of a chain, or coarser grids.
     """
     if method is None:
         return Sweeps().count * 2**n
     if method.coarsest is None and method.relaxes:
         return 1
-    # as many as the sweeps of a chain are worth; see ``Sweeps``
+    # the number of relaxations in the sweeps of a chain, see ``Sweeps``
     evaluation = method.filled(Sweeps()).evaluation
     if method.coarsest is None and isinstance(evaluation, Sweeps):
         return evaluation.count * 2**n
     raise ValueError(
-        f"solve: SemiLagrangian() follows its arcs again and again, and has no matrix for {method!r}; use "
+        f"solve: SemiLagrangian() follows arcs and does not have a matrix for {method!r}; use "
         "hjb.PolicyIteration(), PolicyIteration(Sweeps(...)) or ValueIteration(), on one grid"
     )
 
 
 def estimate(grid: Grid, plan: Plan, dtype: DType) -> int:
-    """Bytes of the arcs and of what is made of them, from a count of the arrays that live at once."""
+    """Bytes for the arcs and the arrays computed from them, from a count of arrays that live at the same time."""
     word = np.dtype(dtype).itemsize
     each = (3 + grid.ndim) * word + 4  # pay, keep, fractions, running cost, cell
     return (each * (plan.count + 2) + 12 * word) * grid.size
@@ -87,15 +87,15 @@ def solve_on_host(
     max_memory: int | None,
     clock: Clock,
 ) -> Solution:
-    """The solution by checks, arcs and steps, in this order, as far as the clock allows; float64 is on if asked for."""
+    """The solution by checks, arcs and steps, in this order, as far as the clock allows; may enable float64."""
     scheme.check(problem, grid)
     times = relaxations(method, grid.ndim)
-    on = Discretisation(problem, grid, Upwind(), kind)  # what is asked of it has nothing to do with slopes
+    on = Discretisation(problem, grid, Upwind(), kind)  # for checks that do not involve slopes
     start = None if guess is None else np.asarray(guess, kind)
     try:
         check_on_one_state(problem, grid, scheme)
         plan = scheme.plan(problem, grid, kind)
-        # before all nodes are looked at, which on a grid that does not fit takes minutes
+        # before all nodes are checked, which takes minutes on a grid that does not fit
         needed = memory.fitting(estimate(grid, plan, kind), grid, max_memory)
         node_checks.values(on, clock)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
@@ -103,19 +103,19 @@ def solve_on_host(
     except Stopped as stop:
         return _said(solution_at_start(on, np.zeros(grid.shape) if start is None else start, stop.status), scheme)
     described = "PolicyIteration()" if method is None else method.described(False)
-    solution.stats.update(bytes=needed, method=f"{described}, {plan.count} arcs a node")
+    solution.stats.update(bytes=needed, method=f"{described}, {plan.count} arcs per node")
     return solution
 
 
 class Followed(NamedTuple):
-    """A solve on arcs at the end of its iteration.
+    """The end of an iteration on arcs.
 
     Attributes:
-      on, scheme, plan: the problem on its grid, the scheme, and the arcs that it tries.
+      on, scheme, plan: the problem on its grid, the scheme, and the arcs it tries.
       task, state: the task and the last state, on the device.
-      code: how the iteration ended.
-      reached: the nodes from which the target is reached; None where there is nothing to reach, or a run was cut.
-      residuals: those of all steps.
+      code: the status.
+      reached: the nodes from which the target is reached; None if there is no target, or the run was cut.
+      residuals: the residuals of all steps.
     """
 
     on: Discretisation
@@ -131,7 +131,7 @@ class Followed(NamedTuple):
 def follow(
     on: Discretisation, scheme: PathScheme, plan: Plan, tol: float, times: int, guess: Nodes | None, clock: Clock
 ) -> Followed:
-    """The arcs of a plan and the iteration on them, as far as the clock allows."""
+    """Compute the arcs of a plan and iterate on them, as far as the clock allows."""
     task, reached = _prepare(on, plan, tol, times, clock)
     run = _Run(task, np.asarray(_start(task)) if guess is None else guess, clock.max_steps)
     code = host_loop.drive(run, clock)
@@ -144,7 +144,7 @@ def follow(
 
 
 def can_replace_chain(problem: Problem, grid: Grid) -> bool:
-    """True if ``SemiLagrangian()`` may solve a problem whose chain is carried past the target; reads no values."""
+    """True if ``SemiLagrangian()`` may solve a problem whose chain is carried past the target; evaluates nothing."""
     ends = problem.target is not None and problem.stopping_cost is None and is_discounted(problem) is not True
     try:
         REPLACEMENT.check(problem, grid)
@@ -156,20 +156,20 @@ def can_replace_chain(problem: Problem, grid: Grid) -> bool:
 def replace_chain(
     on: Discretisation, reach: Reach | None, tol: float, guess: Nodes | None, clock: Clock
 ) -> Followed | None:
-    """The answer on arcs where the chain may be carried past a target that the paths of the system meet.
+    """The solution on arcs, if the chain may be carried past a target that the paths of the system meet.
 
     Without noise and discount the chain still spreads like noise of the size of a cell. If it may miss the target under
-    every policy, its expected cost is infinite, at nodes whose true cost is finite, on every grid. Arcs keep together.
+    every policy, its expected cost is infinite on every grid, at nodes whose true cost is finite. Arcs do not spread.
 
     Args:
       on: the problem on its grid.
       reach: the nodes that the chain reaches, from ``prepare_on_host``.
       tol: as in ``solve``.
-      guess: the caller's, or None.
+      guess: the caller's guess, or None.
       clock: the limits; raises ``Stopped``.
 
     Returns:
-      The end of the iteration. None where the chain is not carried past the target, or the arcs do no better.
+      The end of the iteration. None if the chain is not carried past the target, or the arcs are no improvement.
     """
     if reach is None or on.mesh is not None or np.asarray(on.problem.discount) > 0 or not is_carried_past(reach):
         return None
@@ -181,21 +181,21 @@ def replace_chain(
         memory.fitting(estimate(on.grid, plan, on.dtype), on.grid, None)
         found = follow(on, REPLACEMENT, plan, tol, relaxations(None, on.grid.ndim), guess, clock)
     except (ValueError, MemoryError):
-        return None  # arcs that cost nothing, or too many of them: the chain's answer stands
+        return None  # arcs that cost nothing, or too many of them: keep the solution of the chain
     gains = found.reached is None or bool(np.any(found.reached & ~reach.surely))
     return None if found.code in FAILED or not gains else found
 
 
 def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
-    """The solution of a run that broke, from the value that outlived it; else zero."""
+    """The solution of a failed run, from a saved value; else zero."""
     return solution_at_start(on, np.zeros(on.grid.shape) if kept is None else kept[0], Status.INTERRUPTED)
 
 
 def _prepare(on: Discretisation, plan: Plan, tol: float, times: int, clock: Clock) -> tuple[ArcTask, Mask | None]:
-    """The task, and the nodes from which the target is reached for sure, where that has to be known.
+    """The task, and the nodes from which the target is surely reached, if that matters.
 
     Raises:
-      ValueError: numbers that are not finite on the way of an arc; without a discount an arc that costs nothing.
+      ValueError: values along an arc are not finite, or without a discount an arc costs nothing.
     """
     problem, grid = on.problem, on.grid
     additive = bool(np.asarray(problem.discount) > 0)
@@ -216,7 +216,7 @@ def _prepare(on: Discretisation, plan: Plan, tol: float, times: int, clock: Cloc
 
 @functools.partial(jax.jit, static_argnames="running")
 def _traced(on: Discretisation, plan: Plan, *, running: bool) -> tuple[Arcs, bellman.Obstacles]:
-    """The arcs of a plan and what is given at the nodes, in the type of the solve."""
+    """The arcs of a plan and the prescribed values at the nodes, in the dtype of the solve."""
     on = cast(on, on.dtype)
     obstacles = bellman.obstacles(on)
     return paths.trace(on, plan, obstacles.fixed, running=running), obstacles
@@ -230,7 +230,7 @@ _run = WideJit(arc_iteration.run, donate_argnames="state")
 
 @jax.jit
 def _faults(links: Arcs, fixed: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Per arc whether from some free node it is worth no finite number, and whether from some it costs nothing."""
+    """Per arc: True if its value is not finite from some free node, and true if it costs nothing from some node."""
     along = tuple(range(1, links.pay.ndim))
     broken = jnp.any(~fixed & ~(jnp.isfinite(links.pay) & jnp.isfinite(links.keep)), axis=along)
     free = jnp.zeros(broken.shape, bool)
@@ -240,7 +240,7 @@ def _faults(links: Arcs, fixed: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _check_arcs(on: Discretisation, plan: Plan, links: Arcs, fixed: jax.Array) -> None:
-    """Refuse arcs that are worth no number, and without a discount such that cost nothing."""
+    """Refuse arcs whose value is not finite, and without a discount arcs that cost nothing."""
     broken, free = (np.asarray(found) for found in _faults(links, fixed))
     if broken.any():
         action = plan.actions[int(np.argmax(broken)) // len(plan.legs)]
@@ -252,9 +252,9 @@ def _check_arcs(on: Discretisation, plan: Plan, links: Arcs, fixed: jax.Array) -
     if free.any():
         action = plan.actions[int(np.argmax(free)) // len(plan.legs)]
         raise ValueError(
-            "solve: SemiLagrangian() without discount wants a running cost that is positive off the target, or nothing "
-            f"bounds its error; the action {np.asarray(action).tolist()} pays none somewhere. "
-            "Give a discount > 0, or use hjb.Upwind()"
+            "solve: SemiLagrangian() without discount requires a running cost that is positive off the target, or "
+            f"no bound on its error exists; the action {np.asarray(action).tolist()} costs nothing somewhere. "
+            "Add a discount > 0, or use hjb.Upwind()"
         )
 
 
@@ -265,12 +265,12 @@ class _Run(StatesInChunks):
         super().__init__(task, arc_iteration.begin(task, guess), _run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
-        """Steps of the first chunk, beside the look at the guess: a step looks at every arc of a node."""
+        """Steps of the first chunk, in addition to the initial evaluation; a step evaluates every arc of a node."""
         return int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
 
 
 def finish(followed: Followed) -> Solution:
-    """The solution at the end of a run: values, first actions of the best arcs, bounds, and the words for them."""
+    """The solution at the end of a run: values, first actions of the best arcs, bounds, and their description."""
     on, scheme, plan, task, state, code, reached, residuals = followed
     problem, looked, counted = on.problem, int(state.step) >= 0, np.asarray(task.counted)
     state = jax.device_get(state)
@@ -289,25 +289,25 @@ def finish(followed: Followed) -> Solution:
         residuals=residuals, enclosure=certificates.enclosure(task.certificate, state.bound) if looked else None,
         discrete=isinstance(problem.controls, Finite),
     )  # fmt: skip
-    solution.stats["certificate"] = WORDS[task.certificate] + "; for the arcs that are tried"
+    solution.stats["certificate"] = WORDS[task.certificate] + "; over the arcs of the scheme"
     return _said(solution, scheme)
 
 
 def finish_replacement(followed: Followed) -> Solution:
-    """The solution that stands in for the chain's, with the reason in its message."""
+    """The solution that replaces the chain's, with the reason in its message."""
     solution = finish(followed)
-    solution.stats["method"] = f"PolicyIteration(), {followed.plan.count} arcs a node"
+    solution.stats["method"] = f"PolicyIteration(), {followed.plan.count} arcs per node"
     return dataclasses.replace(solution, message=f"{solution.message} {REASON}")
 
 
 def _said(solution: Solution, scheme: PathScheme) -> Solution:
-    """The solution with the name of the scheme that made it."""
+    """The solution with the name of its scheme."""
     solution.stats["scheme"] = repr(scheme)
     return solution
 
 
 def _leaving(on: Discretisation, value: np.ndarray, policy: np.ndarray, task: ArcTask) -> np.ndarray:
-    """Numbers of nodes at which the optimal drift is cut off, (n, 2), with a warning where they are most of an end."""
+    """The number of nodes at which the optimal drift is cut off, (n, 2), with a warning if it is large."""
     acting = np.asarray(task.counted & task.obstacles.acting(jnp.asarray(value)))
     u = [np.ascontiguousarray(policy[..., j]) for j in range(policy.shape[-1])]
     cut, ends = edges.cut(on.problem, on.grid, np.where(acting, value, 0), (u, []), acting)
@@ -317,7 +317,7 @@ def _leaving(on: Discretisation, value: np.ndarray, policy: np.ndarray, task: Ar
 
 @jax.jit
 def _arriving(task: ArcTask, number: jax.Array) -> jax.Array:
-    """Those that the best arcs bring there, and where that is not all of them those that any arcs do."""
+    """The nodes that the best arcs bring to the target, and if some are missing, those that any arcs bring there."""
     chosen = jax.tree.map(lambda entry: entry[None], task.arcs.chosen(number))
     found = arc_iteration.arriving(chosen, task.grid, task.obstacles.fixed)
     return jax.lax.cond(

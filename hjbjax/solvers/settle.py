@@ -28,11 +28,11 @@ class Settled(NamedTuple):
     Attributes:
       task: the task as it was solved in the end.
       assumptions: what was assumed about it.
-      reached: the nodes that can be brought to the target, bool (*grid); None if nobody asked.
+      reached: the nodes that can be brought to the target, bool (*grid); None if this was not computed.
       state: the last state.
       code: its status.
       residuals: the residuals of all steps.
-      origin: the end of the monotone iteration from which a second-order one started.
+      origin: the end of the monotone iteration from which a second-order iteration started.
       note: a further sentence of the solution's message.
     """
 
@@ -47,7 +47,7 @@ class Settled(NamedTuple):
 
     @property
     def running(self) -> Task:
-        """The task as its program has it: for an answer of high order, the program may be that of its chain."""
+        """The task of the compiled program: for a high-order solution this may be the program of its chain."""
         if self.origin is None or self.origin.task.first_order is None:
             return self.task
         return at_order(self.origin.task, first=False)
@@ -58,7 +58,7 @@ class Settled(NamedTuple):
 
 
 def may_go_on(task: Task, assumptions: Assumptions, state: State, code: Status) -> bool:
-    """True if a run that ended so may have to go on: it may pay to leave a rest node, or a game or a start failed."""
+    """True if a run with this outcome may have to continue: leaving a rest node may pay, or a game or start failed."""
     if code is Status.CONVERGED:
         return assumptions.may_rest and float(np.min(np.asarray(state.value), initial=0)) < 0
     return code in FAILED and (task.problem.is_game or needs_a_way(task))
@@ -76,13 +76,13 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
     value = warm(task, guess, clock)
     state, code, residuals = iterate(task, value, clock)
     if needs_a_way(task):
-        for discounts in FURTHER:  # under a larger discount a policy stays where it is and pays if the way is too long
+        for discounts in FURTHER:  # under a larger discount a policy stays and pays if the path is too long
             if code not in FAILED:
                 break
             value = follow(task, value, discounts, clock)
             state, code, residuals = iterate(task, value, clock)
     evaluation = task.method.evaluation
-    # sweeps follow the drift from the target; on a circle no node is first, and with β Δt ≪ 1 they take 1/(β Δt) rounds
+    # sweeps follow the drift from the target; on a cycle no node is first, and with β Δt ≪ 1 they take 1/(β Δt) rounds
     if code is Status.STALLED and evaluation is not None and evaluation.rough:
         solver = linear_solve(task.grid) if task.on.mesh is None else Krylov()
         task = dataclasses.replace(task, method=PolicyIteration(solver))

@@ -1,4 +1,4 @@
-"""From a problem on a grid to a task: what is held, what counts, which certificate applies, which method runs."""
+"""From a problem on a grid to a task: fixed nodes, counted nodes, certificate and method."""
 
 import dataclasses
 
@@ -27,17 +27,17 @@ from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import warn
 from hjbjax.tracing import checks
 
-OPERATIONS = 10_000  # of one evaluation: XLA takes minutes over a program in which there are a dozen such
-DIRECT = 50_000  # nodes up to which a plane with open ends is solved by sparse LU: about a second a step
-# A sweep hears of the part beside at the next exchange alone: 1600 x 1601 nodes on two devices took 19 steps of three
-# sweeps and 1.4 s, 14 steps of five and 1.2 s; 800 x 801 nodes take .23 s and .27 s.
-BETWEEN_PARTS, MANY = 5, 10**6  # sweeps, and the nodes beyond which there are so many
-NEST = 100_000  # nodes beyond which compiling coarser grids pays
-COARSEST = 20_000  # nodes up to which none is worth it: a step takes under a millisecond, and its program a second
+OPERATIONS = 10_000  # scalar operations per evaluation; XLA takes minutes to compile a dozen such evaluations
+DIRECT = 50_000  # largest plane grid with open ends that is solved by sparse LU, at about a second per step
+# A sweep receives values of the adjacent part only at the next exchange: 1600 x 1601 nodes on two devices took 19 steps
+# of three sweeps and 1.4 s, 14 steps of five and 1.2 s; 800 x 801 nodes take 0.23 s and 0.27 s.
+BETWEEN_PARTS, MANY = 5, 10**6  # sweeps, and the number of nodes above which they are used
+NEST = 100_000  # nodes above which compiling coarser grids pays
+COARSEST = 20_000  # nodes of the coarsest grid: for fewer a step takes under a millisecond, but compiling a second
 
 
 def check_on_one_state(problem: Problem, grid: Grid, scheme: object) -> None:
-    """Refuse functions that one state shows to be wrong, and warn of such as XLA takes minutes to compile."""
+    """Refuse functions that fail at a single state, and warn of those that take XLA minutes to compile."""
     checks.shapes(problem, grid, scheme)
     count = checks.operations_of(problem, grid.ndim).single
     if count > OPERATIONS:
@@ -51,31 +51,31 @@ def check_on_one_state(problem: Problem, grid: Grid, scheme: object) -> None:
 def choose(
     problem: Problem, grid: Grid, *, traced: bool, method: Method | None = None, divided: bool = False
 ) -> Method:
-    """The method that suits a problem, or the one that was asked for with the evaluation that does.
+    """The method that suits a problem, or the requested method with a suitable evaluation.
 
-    ``divided``: the nodes lie on several devices, and no host has them all at once.
+    ``divided``: the nodes are divided among several devices, so no host has all of them.
 
-    Large grids are nested. Tubes without discount have policies without a value of their own: there value iteration
-    alone keeps to the extreme one of many fixed points.
+    Large grids are nested. For tubes without discount, whose policies have no value of their own, only value iteration
+    converges to the extreme one of many fixed points.
     """
     if method is not None:
         return method.filled(choose_evaluation(problem, grid, traced=traced, divided=divided))
-    # a policy that waits at ψ or g for nothing solves its own linear equation with any value
+    # a policy that waits at ψ or g at no cost solves its own linear equation with any value
     if is_constrained(problem) and is_discounted(problem) is False:
         return ValueIteration()
     method = PolicyIteration(choose_evaluation(problem, grid, traced=traced, divided=divided))
-    # from a cold start a good policy spreads by one cell an improvement: N of them on one grid, a few on nested ones;
-    # on the zoo's pendulum with 400 x 401 nodes the steps of all levels took .2 s in place of .9
+    # from a cold start a good policy advances by one cell per improvement: N of them on one grid, a few on nested
+    # grids; on the zoo's pendulum with 400 x 401 nodes the steps of all levels took 0.2 s instead of 0.9 s
     return Nested(method, COARSEST) if grid.size > NEST and not (traced or grid.sides("open")) else method
 
 
 def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool, divided: bool = False) -> Evaluation:
     """The evaluation of policies that suits a problem.
 
-    Where transport rules, a few wavefront sweeps evaluate a policy well enough. Where there is noise they are too slow
-    and precondition a Krylov method; on a line a direct solve costs nothing.
+    If transport dominates, a few wavefront sweeps evaluate a policy well enough. With noise they are too slow and
+    precondition a Krylov method; in 1-D a direct solve is cheap.
     """
-    if grid.sides("open"):  # what is continued from inside is no matter for sweeps; see relaxation
+    if grid.sides("open"):  # sweeps do not support extrapolated values; see ``relaxed``
         small = grid.ndim < 3 and grid.size <= DIRECT and not divided
         return Direct() if small else Krylov()
     if problem.noise is None:
@@ -87,16 +87,16 @@ def march_evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> 
     """The evaluation of policies in an implicit step that suits the problem."""
     if grid.sides("open"):
         return choose_evaluation(problem, grid, traced=False, divided=divided)
-    # sweeps follow the drift and are slow where noise spreads news both ways
+    # sweeps follow the drift and are slow if noise spreads information in both directions
     return Sweeps() if problem.noise is None else Krylov()
 
 
 def choose_scheme(on: Discretisation, method: Method) -> Scheme:
     """The scheme that suits a problem; host level.
 
-    Of second order, by limited slopes, unless noise lets central differences be monotone at every node, which are of
-    second order and certified. Value iteration is the chain's own operator, and a tube without discount must end where
-    V no longer changes: both stay with the chain.
+    It is second order with limited slopes, unless noise makes central differences monotone at every node, which are
+    second order and certified. Value iteration is the operator of the chain, and a tube without discount must end where
+    V no longer changes, so both use the chain.
     """
     problem, calm = on.problem, Limited().chain
     if method.relaxes or (is_constrained(problem) and is_discounted(problem) is False):
@@ -108,27 +108,27 @@ def choose_scheme(on: Discretisation, method: Method) -> Scheme:
 
 @jax.jit
 def _central(on: Discretisation) -> jax.Array:
-    """True if central differences are monotone at all nodes, whatever the action."""
+    """True if central differences are monotone at all nodes, for every action."""
     on = cast(on, on.dtype)
     calm = schemes.calm(on, on.coordinates(), cut_cells.links(on))
     return jnp.all(jnp.stack([jnp.all(axis) for axis in calm]))
 
 
 def linear_solve(grid: Grid) -> Direct | Krylov:
-    """The linear solver that evaluates a policy where sweeps are too slow; host level."""
+    """The linear solver for the evaluation of a policy if sweeps are too slow; host level."""
     return Direct() if grid.ndim == 1 else Krylov()
 
 
 def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "Assumptions") -> Task:
-    """The task of a solve, all arrays in its type; pure, so that it may be traced, batched and differentiated."""
+    """The task of a solve, all arrays in its dtype; pure, so that it may be traced, batched and differentiated."""
     on = cut_cells.kept(cast(on, on.dtype))
     obstacles, still = _obstacles(on, assumptions)
-    # a tube with a traced discount takes relaxations if that is zero, which only the compiled program will see
+    # a tube with a traced discount uses relaxations if it is zero, which only the compiled program can decide
     undecided = assumptions.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
     outflow = None
     if method.relaxes or undecided or assumptions.certificate is Certificate.OPEN:
         rate = fastest_rate(on) + on.problem.discount
-        outflow = jnp.where(rate > 0, rate, 1)  # it is divided by, also where nothing moves
+        outflow = jnp.where(rate > 0, rate, 1)  # it is a divisor, also where nothing moves
     priced = assumptions.costs_certify and still is not None
     return Task(
         on, method, obstacles, jnp.ones(on.grid.shape, bool), still.least if priced and still else None, outflow,
@@ -138,34 +138,34 @@ def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "As
 
 
 def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Standstill | None) -> Scalar | None:
-    """A bound that no value can be less than: the least payment at the end of a run, where no action earns on the way.
+    """A lower bound on all values: the least payment at the end of a run, if no action earns before it.
 
-    None where it was not asked at which cost the system can rest. The least number that there is where something can
-    be earned: it may be traced whether that is so.
+    None if the costs of resting were not computed. The least finite number if something can be earned, a condition that
+    may be traced.
     """
     if still is None or is_constrained(on.problem):
         return None
     costs = jnp.where(jnp.isfinite(still.least), still.least, 0)
     small = resting.ROUNDINGS * jnp.finfo(on.dtype).eps * jnp.max(jnp.abs(costs))
     ends = certificates.lowest_end(obstacles, jnp.ones(on.grid.shape, bool), on.grid)
-    # finite, since a value is compared with a multiple of it
+    # finite, since values are compared with a multiple of it
     return jnp.where(jnp.all(costs >= -small), ends, jnp.finfo(on.dtype).min / 8).astype(on.dtype)
 
 
 def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.Obstacles, resting.Standstill | None]:
-    """The obstacles, rest points among them, and where the system can rest, if that matters to the problem."""
+    """The obstacles, including rest points, and where the system can rest, if this matters to the problem."""
     obstacles, problem = bellman.obstacles(on), on.problem
     if on.scheme.subcell and problem.exit_cost is not None:
         links = cut_cells.links(on)
         met = [jnp.min(jnp.where(*meets, 0)) for link in links for meets in (link.meets_up, link.meets_down) if meets]
-        # a lower bound on V has to lie below every exit cost, also where the boundary runs between the nodes
+        # a lower bound on V must not exceed any exit cost, also where the boundary is between the nodes
         obstacles = dataclasses.replace(obstacles, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
     if not (assumptions.may_rest or assumptions.costs_certify):
         return obstacles, None
     still = resting.standstill(on)
     if not assumptions.may_rest:
         return obstacles, still
-    # under a discount the equation has one solution and nothing need be held; which of both holds may be traced
+    # with a discount the equation has one solution and no rest node is fixed; the discount may be traced
     return dataclasses.replace(obstacles, fixed=obstacles.fixed | (still.rests & (problem.discount == 0))), still
 
 
@@ -174,13 +174,13 @@ BOUNDING = (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE, Certificate.BY_DIS
 
 @dataclasses.dataclass(frozen=True)
 class Assumptions:
-    """Facts on a problem that are known before its numbers are looked at.
+    """Facts about a problem that follow from its structure.
 
     Attributes:
-      certificate: which bound on the error applies.
-      exact: true if the minimum over the actions is exact; there are no bounds otherwise.
-      may_rest: true if rest points at zero cost close the problem (no discount, no constraint).
-      costs_certify: true if without discount the running cost gives a bound, where it is positive.
+      certificate: the applicable error bound.
+      exact: True if the minimum over the actions is exact; otherwise there are no bounds.
+      may_rest: True if rest points at zero cost close the problem (no discount, no constraint).
+      costs_certify: True if without discount a positive running cost gives a bound.
     """
 
     certificate: Certificate
@@ -190,23 +190,23 @@ class Assumptions:
 
     @property
     def sentence(self) -> str:
-        """The argument by which the error is certified, or the reason that it is not."""
+        """The argument that certifies the error, or the reason why there is none."""
         if self.certificate in BOUNDING and not self.exact:
             return "no bounds: the optimum over the actions is searched, and may be missed"
         return self.certificate.value
 
 
 def assumptions_of(on: Discretisation) -> Assumptions:
-    """The assumptions from the structure of the problem; a discount that is traced leaves the certificate open."""
+    """The assumptions from the structure of the problem; a traced discount leaves the certificate undecided."""
     if on.grid.sides("open"):
-        # what is continued from inside makes no chain, so that none of the bounds holds
+        # extrapolated values do not belong to a chain, so none of the bounds holds
         return dataclasses.replace(assumptions_of(on.on_grid(on.grid.walled)), certificate=Certificate.OPEN)
     problem = on.problem
     players, discounted = players_of(on), is_discounted(problem)
     if discounted:
         return Assumptions(Certificate.ADDITIVE, players.exact, may_rest=False)
     fits = problem.running_max is None and problem.cost is not None and not players.disturbance_costs
-    fits &= not on.grid.sides("neumann")  # a slope is a cost at the end, which may be negative
+    fits &= not on.grid.sides("neumann")  # a prescribed slope acts as a cost at the end, which may be negative
     kind = Certificate.MULTIPLICATIVE if fits else Certificate.NONE
     may_rest = not is_constrained(problem) and problem.cost is not None
     return Assumptions(Certificate.BY_DISCOUNT if discounted is None else kind, players.exact, may_rest, fits)
@@ -216,7 +216,7 @@ _prepare_jit = jax.jit(prepare, static_argnames="assumptions")
 
 
 def prepared(on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions) -> Task:
-    """The task of ``prepare`` at host level, by a program that takes spacings and coordinates as they are."""
+    """The task of ``prepare`` at host level, with spacings and coordinates as constants of the program."""
     made = _prepare_jit(on.settled, method=method, tol=tol, assumptions=assumptions)
     return altered(made, on=altered(made.on, grid=jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)))
 
@@ -224,12 +224,12 @@ def prepared(on: Discretisation, *, method: Method, tol: Number, assumptions: As
 def prepare_on_host(
     on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None
 ) -> tuple[Task, Assumptions, Reach | None]:
-    """The task of ``prepare`` with the checks that need values: that there is a finite solution, and where.
+    """The task of ``prepare``, with the checks that require values: if and where there is a finite solution.
 
     It checks the clock between its phases and may raise ``Stopped``.
 
     Returns:
-      The task, the assumptions, and the nodes that reach the target (None where there is nothing to reach).
+      The task, the assumptions, and the nodes that reach the target (None if there is no target).
 
     Raises:
       ValueError: there is no finite solution.
@@ -243,14 +243,14 @@ def prepare_on_host(
         return *_bare(on, method, tol, assumptions), None
     task = prepared(on, method=method, tol=tol, assumptions=assumptions)
     priced = assumptions.certificate is Certificate.MULTIPLICATIVE
-    # where L = 0 the bound by the running cost fails, and a run may go round for ever at no cost as well as rest
+    # where L = 0 the bound by the running cost fails, and a run may cycle indefinitely at no cost, as well as rest
     if (priced and not _costs_positive(task)) or problem.cost is None:
         task = _with_refuge(task)
         assumptions = dataclasses.replace(
             assumptions, may_rest=not is_constrained(problem) and not problem.discount > 0
         )
     if priced and problem.is_game and not _costs_positive(task) and not method.relaxes:
-        # policies that go on for ever at no cost have any value: the one sought is the limit of those of long horizons
+        # policies that continue indefinitely at no cost have any value; the required one is the limit of long horizons
         task = prepared(on, method=ValueIteration(), tol=tol, assumptions=assumptions)
     if priced and not _costs_positive(task):
         assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
@@ -258,7 +258,8 @@ def prepare_on_host(
     held = np.asarray(task.obstacles.fixed)
     undiscounted = problem.discount == 0
     checks.ill_posed(problem, bool(assumptions.may_rest and held.any()), grid)
-    # a game is asked when it fails: all pairs of actions are dear; and a constraint gives every node a finite value
+    # a game is searched only if it fails, because all pairs of actions are expensive; a constraint makes all values
+    # finite
     if problem.is_game or is_constrained(problem) or not held.any():
         return task, assumptions, None
     reach = attainability.reached(task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock)
@@ -268,17 +269,17 @@ def prepare_on_host(
 
 
 def is_bare(method: Method) -> bool:
-    """True if the method keeps nothing but V."""
+    """True if the method stores only V."""
     return method.relaxes and not method.policy
 
 
 def _bare(on: Discretisation, method: Method, tol: float, assumptions: Assumptions) -> tuple[Task, Assumptions]:
-    """The task and the assumptions of a solve that keeps nothing but V: without an array of the nodes."""
+    """The task and the assumptions of a solve that stores only V, without an array of the nodes."""
     additive = assumptions.certificate is Certificate.ADDITIVE
     if not (additive or is_constrained(on.problem)) or on.grid.sides("open"):
         raise ValueError(
-            "ValueIteration(policy=False) keeps V alone, which tells no bound without a discount and ends by itself "
-            "for tubes; give discount > 0 and no open ends, or leave policy=False out"
+            "ValueIteration(policy=False) stores only V. It has no error bound without a discount, and converges on "
+            "its own only for tubes. Use discount > 0 and no open ends, or remove policy=False"
         )
     certificate = Certificate.ADDITIVE if additive else Certificate.NONE
     on, nothing = cast(on, on.dtype), bellman.Obstacles(jnp.zeros((), bool), jnp.zeros((), on.dtype))
@@ -290,12 +291,12 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:
     """The task of a game that did not converge, without the nodes from which the target cannot be forced.
 
     Returns:
-      The task and the nodes that are left; ``None`` where that is no question.
+      The task and the remaining nodes; ``None`` if forcing does not matter.
     """
     held = np.asarray(task.obstacles.fixed)
     if not task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0 or not held.any():
         return task, None
-    # who keeps away from the target, and pays for it, may leave a finite cost
+    # an opponent who avoids the target, and pays for it, may leave a finite cost
     if task.certificate is not Certificate.MULTIPLICATIVE:
         return task, None
     reached = attainability.forced(task.on, held, least=_least_rate(task), clock=clock)
@@ -306,14 +307,14 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:
 
 
 def _with_refuge(task: Task) -> Task:
-    """The task with the nodes held at zero among which a run may go on for ever and pay nothing, as where it rests."""
+    """The task with nodes fixed at zero where a run may continue indefinitely without paying, as at rest nodes."""
     if task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0:
         return task
-    # on the target the run is over; everywhere else it could go on at the least cost of all actions
+    # on the target the run has ended; elsewhere it could continue at the least cost of all actions
     free = ~np.broadcast_to(np.asarray(task.obstacles.ended), task.grid.shape)
     least = np.zeros(task.grid.shape) if task.least_cost is None else np.asarray(task.least_cost)
     small = resting.ROUNDINGS * np.finfo(task.tol.dtype).eps * np.max(np.abs(least))
-    # where something can be earned it is no matter of course that going round for nothing is optimal
+    # if something can be earned, cycling at no cost need not be optimal
     if np.any(least[free] < -small):
         return task
     found = attainability.refuge(task.on, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype))
@@ -321,20 +322,20 @@ def _with_refuge(task: Task) -> Task:
 
 
 def _costs_positive(task: Task) -> bool:
-    """True if the running cost is positive wherever the value is not given."""
+    """True if the running cost is positive at all free nodes."""
     return bool(np.all(np.asarray(task.least_cost)[~np.asarray(task.obstacles.fixed)] > 0))
 
 
 def _least_rate(task: Task) -> Number:
-    """The rate up to which jumps are rounding beside those of the fastest motion on the grid; zero if unknown."""
+    """The jump rate that counts as rounding relative to the fastest motion on the grid; zero if unknown."""
     if task.crossing is None:
         return np.zeros((), task.tol.dtype)
-    # nodes of all axes over the time of a crossing: the rate of jumps of the fastest motion
+    # the sum of the nodes over all axes, over the time of a crossing: the jump rate of the fastest motion
     return resting.ROUNDINGS * jnp.finfo(task.tol.dtype).eps * sum(task.grid.shape) / known(task.crossing)
 
 
 def _finite_part(task: Task, reached: Mask) -> Task:
-    """The task on the nodes with a finite value; the others are held above, so that no optimal action goes there."""
+    """The task on the nodes with a finite value; the others are set above, so that no optimal action leads there."""
     obstacles = dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | ~jnp.asarray(reached))
     return dataclasses.replace(task, obstacles=obstacles, counted=task.counted & jnp.asarray(reached), has_lost=True)
 
@@ -345,7 +346,7 @@ def is_carried_past(reach: Reach) -> bool:
 
 
 def warn_unreached(reach: Reach, *, undiscounted: bool) -> None:
-    """Warn of nodes from which the target is not reached, or not surely; and say what their value is."""
+    """Warn of nodes from which the target is not reached, or not surely, and explain their value."""
     never, passed = (100 * float(np.mean(each)) for each in (~reach.maybe, reach.maybe & ~reach.surely))
     what = "their value is inf" if undiscounted else "their value is the discounted cost of never arriving"
     if not passed:

@@ -1,6 +1,6 @@
-"""The front door: ``solve``.
+"""Stationary problems: ``solve``.
 
-It validates its arguments, and hands over to the host, which picks a method, drives the iteration from grid to grid and
+It validates its arguments, and calls the host, which chooses a method, drives the iteration from grid to grid and
 reports. Inside JAX transformations the compiled program calls the host: see ``transformed``.
 """
 
@@ -37,7 +37,7 @@ from hjbjax.solvers.transformed import Asked
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
-# no host looks on inside a transformation: far more steps than policy iteration takes, and an end for all others
+# inside a transformation the steps are not monitored: a limit far above the steps of policy iteration
 TRACED_STEPS = 10_000
 
 
@@ -65,46 +65,46 @@ def solve(
     min{ max{ β V − H(x, DV, D²V), V − ψ }, V − g } = 0 for the Kushner–Dupuis chain, to a certified error.
 
     Args:
-      problem: the question.
-      grid: the nodes.
-      method: ``PolicyIteration(...)`` or ``ValueIteration()``; ``None`` picks by the problem.
-      scheme: ``Upwind()``, first order and monotone; ``Limited()``, second order where the value is smooth; or
-        ``Weno5()``, fifth order there, on equal spacings, for a ``tol`` as small as its error; or ``SemiLagrangian()``,
-        monotone, for deterministic problems whose optimal paths run along kinks of the value. ``None`` is
-        ``Limited()`` where its iteration converges, with an estimate of the grid's error. It is ``Upwind()`` for value
-        iteration and tubes without discount, and wherever noise lets central differences be monotone. It is
-        ``SemiLagrangian()`` where the chain may be carried past an undiscounted target that paths without noise reach,
-        if ``method`` is ``None``, too; the message of the solution says so.
-      tol: bound to reach on |V − V_h|, in cost units, V_h the exact solution on the grid of the monotone scheme. Where
-        no certificate exists the solution says so, and the bound is on the residual and on the last step, as it is for
-        the high-order equation; a tube without discount goes on until V no longer changes.
-      guess: node values to start from, shape (*grid); not for a tube without discount, which has many fixed points.
-      dtype: ``None`` is float64; inside a transformation the answer is rounded to the type of ``float`` there.
+      problem: the problem.
+      grid: the grid.
+      method: ``PolicyIteration(...)`` or ``ValueIteration()``; ``None`` chooses by the problem.
+      scheme: ``Upwind()``, first order and monotone; ``Limited()``, second order where the value is smooth;
+        ``Weno5()``, fifth order there, on equal spacings, if ``tol`` is as small as its error; or ``SemiLagrangian()``,
+        monotone, for deterministic problems whose optimal paths follow kinks of the value. ``None`` is ``Limited()`` if
+        its iteration converges, with an estimate of the grid error. It is ``Upwind()`` for value iteration, for tubes
+        without discount, and if noise makes central differences monotone. If ``method`` is ``None`` too, it is
+        ``SemiLagrangian()`` where the chain may be carried past an undiscounted target that paths without noise reach;
+        the message of the solution reports this.
+      tol: bound on |V − V_h| to reach, in cost units, where V_h is the exact solution on the grid of the monotone
+        scheme. Without a certificate, which the solution reports, and for the high-order equation, it bounds the
+        residual and the last step. A tube without discount continues until V no longer changes.
+      guess: initial node values, shape (*grid); not for a tube without discount, which has many fixed points.
+      dtype: ``None`` is float64; inside a transformation the result is rounded to the type of ``float`` there.
         ``"float32"`` for memory, with a tolerance that float32 can reach.
-      max_steps: at most so many steps, by each scheme and on each grid.
-      time_limit: at most so many seconds, checks and compilation included; what cannot be cut, as one compilation or
-        one step, is let come to its end.
-      throw: raise when the solve does not converge, or inside a transformation return NaN; else the status says it.
-      progress: say each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
-      max_memory: bytes that the solve may take, instead of what is free.
+      max_steps: largest number of steps for each scheme and grid.
+      time_limit: seconds, including checks and compilation; a single compilation or step is not interrupted.
+      throw: raise if the solve does not converge, or inside a transformation return NaN; otherwise the status reports
+        it.
+      progress: print each phase as it begins, and show a bar of the steps after a second; ``None``: on a terminal.
+      max_memory: bytes that the solve may use, instead of the free memory.
       checkpoint: a file for the state of the run, written every minute and at the end, or ``Checkpoint(path, every=)``.
-      resume: go on from that file if it is there, to the same bits; host level.
-      mesh: divide the nodes over its devices, its i-th axis those along the i-th axis of the grid, as in
+      resume: continue from that file if it exists, with the same bits; host level.
+      mesh: divide the nodes among its devices; its i-th axis divides the i-th axis of the grid, such as
         ``jax.make_mesh((4, 2), ("a", "b"))``; host level.
 
     Returns:
-      The solution; NumPy arrays at host level. Inside ``jit``, ``vmap`` and ``grad`` the compiled program calls the
-      host, so that the answer is the same, in the type of the transformation. Value and policy are then traced, and
-      differentiable with respect to every number in the problem and the grid. They are NaN, like their derivatives,
-      where the solve did not converge, unless ``throw`` is false. A derivative whose linear solve does not converge is
-      NaN, too. Warnings and messages do not leave a transformation.
+      The solution, with NumPy arrays at host level. Inside ``jit``, ``vmap`` and ``grad`` the compiled program calls
+      the host, so the result is the same, in the dtype of the transformation. Value and policy are then traced, and
+      differentiable with respect to every number in the problem and the grid. If the solve does not converge they and
+      their derivatives are NaN, unless ``throw`` is false. A derivative whose linear solve does not converge is NaN
+      too. Warnings and messages are lost in a transformation.
 
     Raises:
-      ValueError: a question without an answer, or a bad argument.
-      MemoryError: a grid that does not fit, before anything is compiled.
+      ValueError: the problem has no solution, or an argument is invalid.
+      MemoryError: the grid does not fit; raised before anything is compiled.
       FileExistsError: the checkpoint exists, without ``resume``.
-      FileError: the checkpoint belongs to another question, is in use by another run, or cannot be written.
-      SolveError: no convergence, be it by Ctrl-C, with the partial solution as ``.solution``.
+      FileError: the checkpoint belongs to another problem, is in use by another run, or cannot be written.
+      SolveError: no convergence, or Ctrl-C; the partial solution is ``.solution``.
 
     Example:
       >>> import hjbjax as hjb
@@ -115,7 +115,7 @@ def solve(
     """
     check_limits(max_steps, time_limit)
     check_arguments(problem, grid, method, scheme, tol, guess, paths=True)
-    grid.check_indices()  # inside transformations as well, where nobody asks for the memory
+    grid.check_indices()  # also inside transformations, where the memory is not checked
     traced, free = is_traced(problem, grid, guess, tol), method is None
     if mesh is not None:
         known = choose(problem, grid, traced=traced, method=method, divided=True)
@@ -147,10 +147,10 @@ def solve(
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
     on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh)
     choices = Choices(scheme=scheme is None, method=free, levels=free)
-    # float64 for this call alone: another thread, and the caller's own programs, keep theirs
+    # float64 for this call only: other threads, and the caller's own programs, keep their type
     with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
         clock.journal = kept and kept.journal()
-        check_on_one_state(problem, grid, on.scheme)  # before the memory, for which functions may be read
+        check_on_one_state(problem, grid, on.scheme)  # before the memory check, which reads functions
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, choices), clock)
@@ -160,7 +160,7 @@ def solve(
 
 
 def _ended(solution: Solution, clock: Clock, tol: float, *, throw: bool) -> Solution:
-    """The solution with its times; raises ``SolveError`` where it did not converge and that was asked for."""
+    """The solution with its times; raises ``SolveError`` if it did not converge and ``throw`` is set."""
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping,
         tol=tol, **({} if clock.journal is None else {"checkpoint": clock.journal.file.outcome}),
@@ -171,9 +171,9 @@ def _ended(solution: Solution, clock: Clock, tol: float, *, throw: bool) -> Solu
 
 
 def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
-    """The solution of a run that broke, from the value that outlived it, maybe on a coarser grid; else zero."""
+    """The solution of a failed run, from a saved value, maybe on a coarser grid; else zero."""
     if kept is None:
-        value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape)  # one zero seen everywhere takes no memory
+        value = np.broadcast_to(np.zeros((), on.dtype), on.grid.shape)  # a broadcast zero takes no memory
     else:
         value, grid = kept
         value = value if grid.shape == on.grid.shape else nested_grids.prolong(value, grid, on.grid)
@@ -182,15 +182,15 @@ def _partial(on: Discretisation, kept: host_loop.Kept | None) -> Solution:
 
 @as_one_program
 def _solve_traced(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: Number) -> Solution:
-    """The solution inside a JAX transformation: the host's, found by a call from the compiled program.
+    """The solution inside a JAX transformation, computed by the host in a call from the compiled program.
 
-    Its derivative is that of the equation that the answer solves, and is part of the program.
+    Its derivative is the derivative of the equation that it solves, and is part of the program.
     """
     return transformed.solve(problem, grid, asked, guess, tol)
 
 
 def check_limits(max_steps: object, time_limit: object) -> None:
-    """Refuse a number of steps or of seconds that limits no run."""
+    """Refuse an invalid limit on steps or seconds."""
     if max_steps is not None:
         arguments.count(max_steps, "solve: max_steps")
     if time_limit is not None:
@@ -201,9 +201,9 @@ def check_arguments(
     problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None,
     *, paths: bool = False,
 ) -> None:  # fmt: skip
-    """Refuse arguments with which no solve can start; needs no values of the problem's functions.
+    """Refuse arguments with which no solve can start, without evaluating the problem's functions.
 
-    ``paths``: a scheme that follows paths is offered.
+    ``paths``: schemes that follow paths are accepted.
     """
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         kinds = f"{type(problem).__name__}, {type(grid).__name__}"
@@ -215,8 +215,8 @@ def check_arguments(
     arguments.positive(tol, "solve: tol", "in the units of the cost")
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
         raise ValueError(
-            "solve: without discount a stopping_cost or a running_max has many fixed points, and the one sought is "
-            "found from the constraint itself;\nleave out guess, and raise max_steps where they ran out"
+            "solve: without discount a stopping_cost or a running_max has many fixed points, and the iteration must "
+            "start from the constraint itself;\nremove guess, and raise max_steps if necessary"
         )
     if problem.terminal_cost is not None:
         raise ValueError("solve: a terminal_cost belongs to a finite horizon; a stationary problem has none")
@@ -225,7 +225,7 @@ def check_arguments(
 
 
 def check_node_values(values: object, grid: Grid, name: str) -> None:
-    """Refuse values that are not one finite real number a node; None passes."""
+    """Refuse values that are not one finite real number per node; None passes."""
     if values is None:
         return
     try:
@@ -234,7 +234,7 @@ def check_node_values(values: object, grid: Grid, name: str) -> None:
         raise ValueError(
             f"{name} is {arguments.shown(values)}; wanted real node values of shape {grid.shape}"
         ) from None
-    if array.dtype.kind not in "fiu":  # truth values and complex numbers are none
+    if array.dtype.kind not in "fiu":  # not booleans or complex numbers
         raise ValueError(f"{name} holds {array.dtype}; wanted real node values of shape {grid.shape}")
     if array.shape != grid.shape:
         hint = "; it looks transposed" if array.shape == grid.shape[::-1] else ""

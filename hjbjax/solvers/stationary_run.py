@@ -1,4 +1,4 @@
-"""A solve in chunks of steps, of one problem or of lanes of one ``vmap``ped loop, with the residuals of all steps."""
+"""A solve in chunks of steps, for one problem or for lanes of one ``vmap``ped loop, with all residuals."""
 
 import dataclasses
 import functools
@@ -23,28 +23,28 @@ from hjbjax.solvers.host_loop import FIRST_NODES, WideJit
 from hjbjax.tracing import checks
 
 T = TypeVar("T")
-CHUNK = 8  # steps between two looks at which lanes are done, at most
-MANY_NODES = 2_000_000  # beyond which the look at the guess is a chunk of its own: a step may take many times as long
+CHUNK = 8  # largest number of steps between two checks of which lanes are done
+MANY_NODES = 2_000_000  # above which the initial evaluation is its own chunk, since a step may take far longer
 
-# a state is used once: the next one takes its place in memory
+# a state is used once: the next one reuses its memory
 run = WideJit(fixed_point.run, donate_argnames="state")
-# where Python is called on the way, and may raise, the state before must outlast it
+# if Python is called from the program, which may raise, the previous state must survive
 _run_kept = WideJit(fixed_point.run)
 _begin = jax.vmap(fixed_point.begin)
 
 
 @functools.partial(WideJit, static_argnames="over")
 def _run_lanes(tasks: Task, states: State, until: Array, over: Lanes) -> State:
-    """``fixed_point.run`` for lanes that run together, those of every device by themselves."""
-    # under vmap a loop goes on until its last lane is done; lanes that are done keep their state by a select and pay
-    # for the others' steps all the same, hence the short chunks
+    """``fixed_point.run`` for lanes that run together, separately on every device."""
+    # under vmap a loop runs until its last lane is done; lanes that are done keep their state by a select and still pay
+    # for the others' steps, so chunks are short
     each = over.in_turn if over.on_processors else jax.vmap
     return over.mapped(each(fixed_point.run))(tasks, states, until)
 
 
 @functools.partial(WideJit, static_argnames="parts", donate_argnames="state")
 def _run_in_parts(task: Task, state: State, until: Number, parts: Parts) -> State:
-    """``fixed_point.run`` on every device of a mesh at once, each with its own nodes."""
+    """``fixed_point.run`` on all devices of a mesh, each with its own nodes."""
 
     def here(task: Task, state: State, until: Number) -> State:
         return fixed_point.run(on_part(task, parts), state, until)
@@ -54,54 +54,54 @@ def _run_in_parts(task: Task, state: State, until: Number, parts: Parts) -> Stat
 
 
 def state_over_nodes(state: State) -> State:
-    """The leaves of a state that hold a value at every node, as truth values."""
-    # where V alone is kept the policy has no nodes
+    """Mark the leaves of a state that have a value at every node."""
+    # if only V is stored the policy has no nodes
     value, policy = jax.tree.map(lambda leaf: jnp.ndim(leaf) > 0, (state.value, state.policy))
     return altered(jax.tree.map(lambda _: False, state), value=value, policy=policy)
 
 
 def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> tuple[State, Status, np.ndarray]:
-    """Iterate from a guess in chunks of steps until the state stops, the steps or the time run out, or Ctrl-C.
+    """Iterate from a guess in chunks until the state stops, the limit of steps or time is reached, or Ctrl-C.
 
     Args:
-      task: what to iterate.
-      guess: node values to start from.
-      clock: the limits, and where the time goes.
-      most: at most so many steps, if fewer than the clock allows: the way to another guess is worth few of them.
+      task: the task.
+      guess: initial node values.
+      clock: the limits, and the pace.
+      most: the largest number of steps, if less than the clock allows, for iterations that only improve a guess.
 
     Returns:
-      The last state, how it ended, and the residuals of all steps, that of the guess first.
+      The last state, its status, and the residuals of all steps, starting with the guess.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
     parts = task.on.parts
     iteration = StationaryRun(task, guess, limit) if parts is None else RunInParts(task, guess, limit, parts)
     if most is not None:
-        iteration.name += ", on the way to a guess"
+        iteration.name += ", computing a guess"
         iteration.passing = most <= clock.max_steps
     status, state = host_loop.drive(iteration, clock), iteration.gathered()
-    # a run that ended before its first look still holds the guess as it came
+    # a run that ended before its initial evaluation still contains the raw guess
     if status is Status.NONFINITE or status in CUT:
         state = with_obstacles(task, state)
     return state, status, np.concatenate(iteration.residuals)[: int(state.step) + 1]
 
 
 def with_obstacles(task: Task, state: State) -> State:
-    """The state with what is given at its nodes, which a guess that nobody looked at does not have."""
+    """The state with fixed values inserted, which a guess that was not evaluated may lack."""
     return dataclasses.replace(state, value=task.obstacles.impose(jnp.asarray(state.value)))
 
 
 class StatesInChunks:
-    """An iteration whose state holds all there is: the last one, and the one before the chunk that is running.
+    """An iteration that is described by its state: the last one, and the one before the current chunk.
 
     Args:
-      task: what is iterated, with ``grid`` and ``tol``.
-      state: where it begins, at step −1, with ``step``, ``code``, ``history``, ``bound`` and ``value``.
-      run: from a task, a state and a number of steps to the state then; it may donate the state.
+      task: the task, with ``grid`` and ``tol``.
+      state: the initial state, at step −1, with ``step``, ``code``, ``history``, ``bound`` and ``value``.
+      run: a function from a task, a state and a number of steps to the new state; it may donate the state.
       guess: the value to fall back on.
-      limit: of the steps.
+      limit: the largest number of steps.
     """
 
-    longest = HISTORY  # a chunk records the residuals of so many steps
+    longest = HISTORY  # a chunk records the residuals of this number of steps
     passing = False
 
     def __init__(self, task: Any, state: Any, run: Callable[..., Any], guess: Nodes, limit: int):
@@ -113,26 +113,26 @@ class StatesInChunks:
         self._run = run
 
     def compile(self) -> None:
-        """Run no step: the state is at step −1, before the look at the guess."""
+        """Call the program with zero steps: the state is at step −1, before the evaluation of the guess."""
         self.before, self.state = self.state, self._run(self.task, self.state, -1)
 
     def advance(self, count: int) -> Status:
-        """Take ``count`` steps at most; the look at the guess comes with the first of them."""
+        """Take at most ``count`` steps; the first of them also evaluates the guess."""
         until = int(min(max(self.steps, 0) + count, self.limit))
-        # in one assignment: an interrupt may come from here on, and the state before may be donated
+        # in one assignment: an interrupt may come at any time, and the previous state may have been donated
         self.before, self.state = self.state, self._run(self.task, self.state, until)
         status = Status(int(self.state.code))
         self._note()
         return status
 
     def _note(self) -> None:
-        """Write down the residuals of the last chunk, once."""
+        """Record the residuals of the last chunk, once."""
         done = int(self.state.step)
         self.residuals.append(np.asarray(self.state.history)[: done - self.steps])
         self.steps = done
 
     def between(self, status: Status, clock: Clock) -> Status:
-        """Write down what an interrupt left open."""
+        """Record the residuals that an interrupt left unrecorded."""
         if status is Status.INTERRUPTED:
             self._note()
         return status
@@ -146,14 +146,14 @@ class StatesInChunks:
         return [np.concatenate(self.residuals), *jax.tree.leaves(self.gathered())]
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from a state that was saved.
+        """Continue from a saved state.
 
         Raises:
           ValueError: the arrays are not a state of this run, with one residual per step and one before the first.
         """
         residuals, *leaves = arrays
         check_alike(leaves, jax.tree.leaves(self.gathered()))
-        # copied to the device: a state is donated
+        # copied to the device, because a state is donated
         on_device = [jax.device_put(leaf, may_alias=False) for leaf in leaves]
         state = jax.tree.unflatten(jax.tree.structure(self.state), on_device)
         check_alike([residuals], [np.broadcast_to(0.0, int(state.step) + 1)])
@@ -162,46 +162,47 @@ class StatesInChunks:
         self.residuals, self.steps = [residuals], int(state.step)
 
     def show(self, bar: Any) -> None:
-        """Move the progress bar; the look is no step."""
+        """Advance the progress bar; the initial evaluation is not a step."""
         bar.update(max(self.steps, 0) - bar.n)
         error, tol = float(self.state.bound.error), float(self.task.tol)
         bar.set_postfix_str(f"error {error:.2e}, tol {tol:.0e}", refresh=False)
 
     def keep(self, error: Exception) -> None:
-        """Attach the value to an exception: of the step that failed, the one before unless donated, the guess."""
+        """Attach the best available value to an exception: of the last state, the previous state, or the guess."""
         host_loop.keep(error, self.task.grid, lambda: self.state.value, lambda: self.before.value, lambda: self.guess)
 
 
 class StationaryRun(StatesInChunks):
-    """The iteration of a task of the chain, or of one with slopes of high order behind it."""
+    """The iteration of a task of the chain, or of a high-order task based on it."""
 
     def __init__(self, task: Task, guess: Nodes, limit: int):
         task = altered(task, on=task.on.settled)
         super().__init__(task, fixed_point.begin(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
-        """Steps of the first chunk on this grid, before any is timed there, beside the look at the guess.
+        """Steps of the first chunk on this grid, before any is timed there, in addition to the initial evaluation.
 
-        A coarser grid tells what they take; a finer one may fall out of the cache, hence half a chunk's time. One alone
-        where a step may take many passes over the nodes, and more of them on a finer grid.
+        The pace on a coarser grid predicts them; a finer one may exceed the cache, so half a chunk's time is planned.
+        The first chunk is a single step if steps take many passes over the nodes, and more of them on a finer grid.
         """
         evaluation = self.task.method.evaluation
-        # the look is one pass over the nodes, a step with a linear solve hundreds: it is timed before one is begun
+        # the initial evaluation is one pass over the nodes, a step with a linear solve hundreds, so it is timed
+        # separately
         if clock.per_node is None and self.nodes > MANY_NODES:
             return 0
-        # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: what a step took
-        # on a coarser grid says nothing
+        # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: the time of a step
+        # on a coarser grid does not predict them
         if self.task.problem.is_game or (evaluation is not None and not evaluation.rough):
             return 1
         if clock.per_node is None:
             steps = FIRST_NODES / self.nodes
         else:
             steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), self.nodes)
-        return int(np.clip(steps, 1, HISTORY - 1))  # one place of the history is the look's
+        return int(np.clip(steps, 1, HISTORY - 1))  # the initial evaluation takes one entry of the history
 
 
 class RunInParts(StationaryRun):
-    """The iteration of a task whose nodes are divided over many devices."""
+    """The iteration of a task whose nodes are divided among several devices."""
 
     def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts):
         super().__init__(task, guess, limit)
@@ -215,42 +216,42 @@ class RunInParts(StationaryRun):
         return self.parts.gathered(self.state, self._over)
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Go on from a state that was saved, by whatever number of devices."""
+        """Continue from a saved state, on any number of devices."""
         super().restore(arrays)
         self.before = self.state = self.parts.spread(self.state, self._over)
 
     def keep(self, error: Exception) -> None:
         """Attach the value to an exception, as without parts."""
-        # what other processes hold is out of reach: they may not have come to this exception
+        # data in other processes is inaccessible, since they may not have raised this exception
         states = () if spans_processes(self.parts.mesh) else (self.state, self.before)
         values = (lambda s=s: self.parts.gathered(s, self._over).value for s in states)
         host_loop.keep(error, self.grid, *values, lambda: self.guess)
 
 
 def _calls_back(task: Task) -> bool:
-    """True if a step calls Python on the host, be it for a solve or in a function of the user's."""
+    """True if a step calls Python on the host, for a solve or in a function of the user."""
     evaluation = task.method.evaluation
     return (evaluation is not None and evaluation.calls_back) or checks.calls_back(task.problem, task.grid.ndim)
 
 
 class Rows(NamedTuple):
-    """The rows of the arrays in which lanes run together; one value, so that an interrupt finds all of it or none."""
+    """The rows of the arrays in which lanes run together; a single value, so that interrupts find it consistent."""
 
-    lanes: np.ndarray  # which lane each row holds; −1 in rows that only fill up
+    lanes: np.ndarray  # the lane of each row; −1 in padding rows
     tasks: Task
     states: State
     before: np.ndarray  # the steps of each row before the last chunk
 
 
 class LanesRun:
-    """The iterations of lanes that run together; those that are done are taken out where that halves the work."""
+    """The iterations of lanes that run together; finished lanes are removed when this halves the work."""
 
     longest, bar = CHUNK, {"desc": "solve_batch", "unit": " steps"}
 
     def __init__(self, tasks: Task, starts: Array, limit: int, over: Lanes):
         count, self.name, self.over = len(starts), f"{len(starts)} lanes", over
         states, lanes = _begin(tasks, starts), np.arange(over.filled(count))
-        if lanes.size > count:  # every device takes as many rows
+        if lanes.size > count:  # every device has the same number of rows
             (tasks, states), lanes = _take((tasks, states), lanes % count), np.where(lanes < count, lanes, -1)
         self.rows = Rows(lanes, *over.spread((tasks, states)), np.full(lanes.size, -1))
         self.limit, self.steps = limit, -1
@@ -259,15 +260,15 @@ class LanesRun:
 
     @property
     def nodes(self) -> int:
-        """The nodes of all rows: the loop runs over those that only fill up as well."""
+        """The nodes of all rows, including padding rows."""
         return self.rows.states.value.size
 
     def _run(self, until: np.ndarray) -> State:
-        """The states when so many steps of each row are done, or it is."""
+        """The states after this number of steps per row, or when the row is done."""
         return _run_lanes(self.rows.tasks, self.rows.states, self.over.spread(until), self.over)
 
     def compile(self) -> None:
-        """Run no step."""
+        """Call the program with zero steps."""
         self.rows = self.rows._replace(states=self._run(self.rows.before))
 
     def first_chunk(self, clock: Clock) -> int:
@@ -275,16 +276,16 @@ class LanesRun:
         return int(np.clip(FIRST_NODES / self.nodes, 1, CHUNK))
 
     def advance(self, count: int) -> Status:
-        """Take ``count`` steps at most in every row; the loop runs as long as its slowest lane."""
+        """Take at most ``count`` steps in every row; the loop runs as long as its slowest lane."""
         before = self.over.gathered(self.rows.states.step)
-        # an array: rows that are done stand where they stopped
+        # an array: finished rows keep their number of steps
         until = np.minimum(np.maximum(before, 0) + count, self.limit)
         self.rows = self.rows._replace(states=jax.block_until_ready(self._run(until)), before=before)
         self.steps += max(int(np.max(self.over.gathered(self.rows.states.step) - before)), 1)
         return Status.RUNNING
 
     def between(self, status: Status, clock: Clock) -> Status:
-        """Take out the lanes that are done, with all of them CONVERGED; one that is cut short ends them all."""
+        """Remove the finished lanes; CONVERGED when all are done; a lane that is cut short ends them all."""
         rows = self.rows
         if not rows.lanes.size:
             return status
@@ -297,7 +298,7 @@ class LanesRun:
         if ended:
             on_host = self.over.gathered(rows.states)
             for row in ended:
-                # copied, or a view would keep the arrays of all lanes alive
+                # copied, because a view would keep the arrays of all lanes alive
                 last = jax.tree.map(lambda leaf, row=row: leaf[row].copy(), on_host)
                 own = Status(int(last.code))
                 cut = status if status is not Status.RUNNING else Status.MAX_STEPS
@@ -306,20 +307,20 @@ class LanesRun:
         return status if self.rows.lanes.size else Status.CONVERGED
 
     def _note(self, lane: int, chunk: np.ndarray, residuals: int) -> None:
-        """Write down the residuals of a lane's last chunk, so that there are so many of them: once."""
+        """Record the residuals of a lane's last chunk up to this number of residuals, once."""
         missing = residuals - sum(map(len, self.histories[lane]))
         self.histories[lane].append(chunk[len(chunk) - missing :])
 
     def _narrow(self, left: np.ndarray) -> None:
-        """Go on with these rows alone, where that halves the work."""
+        """Continue with these rows only, if this halves the work."""
         rows, over, before = self.rows, self.over, self.over.gathered(self.rows.states.step)
-        # powers of two, since every width is compiled for itself: a thousand lanes take eleven programs at most
+        # powers of two, since every width is compiled separately: a thousand lanes take at most eleven programs
         width = over.filled(1 << (left.size - 1).bit_length()) if left.size else 0
         if width < rows.lanes.size:
             kept, before = np.resize(left, width), before[np.resize(left, width)]
             lanes = np.where(np.arange(width) < left.size, rows.lanes[kept], -1)
             both = rows.tasks, rows.states
-            if over.mesh is not None:  # by way of the host: rows go to other devices
+            if over.mesh is not None:  # through the host, because rows move to other devices
                 both = over.gathered(both)
             rows = Rows(lanes, *over.spread(_take(both, kept)), before)
         self.rows = rows._replace(before=before)
@@ -335,14 +336,14 @@ class LanesRun:
         return []
 
     def restore(self, arrays: list[np.ndarray]) -> None:
-        """Nothing, likewise."""
+        """Nothing: lanes that run together have no checkpoint."""
 
     def keep(self, error: Exception) -> None:
-        """Nothing: the lanes that were done before this round are what is left."""
+        """Nothing: the result consists of the lanes that finished before this round."""
 
 
 def stacked(trees: Sequence[T]) -> T:
-    """One tree of trees of one structure, with a leading axis of lanes in every leaf."""
+    """Stack trees of the same structure, with a leading axis of lanes in every leaf."""
     return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves)), *trees)
 
 

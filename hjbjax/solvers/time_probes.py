@@ -1,13 +1,13 @@
-"""Steps short enough for functions of the time: a look at them between the times that a march would see.
+"""Steps short enough for functions of time, found by sampling these between the times that a march would use.
 
-A march sees its functions at the ends of its steps. Over a hundred steps of T = 1 the cost 1 + cos(200πt) is 2 at each
-of them, and a pulse of width 0.004 is at none. So before a march the functions are looked at in some states, 192 times
-in each of a hundred equal parts of the horizon. With ḡ their trapezoidal rule on the ends of the steps,
+A march evaluates its functions at the ends of its steps. Over a hundred steps of T = 1 the cost 1 + cos(200πt) is 2 at
+each of them, and a pulse of width 0.004 is at none. Before a march the functions are therefore sampled in some states,
+192 times in each of a hundred equal parts of the horizon. With ḡ their trapezoidal rule on the ends of the steps,
 
     Σ over steps |∫ g dt − ḡ Δt| ≤ 0.002 ∫ |g| dt        for drift, cost and noise,
     no excursion beyond both ends of a step by more than 0.02 (max g − min g)  for target, ψ and running maximum
 
-decide in how many steps, up to 64, each part of the horizon is cut; smooth functions leave it at one.
+determine the number of steps, up to 64, for each part of the horizon; for smooth functions it is one.
 """
 
 import dataclasses
@@ -25,22 +25,22 @@ from hjbjax.problem.types import Array, DType
 from hjbjax.solution.status import warn
 
 PARTS = 100  # of the horizon, each at least one step
-CUTS = (1, 2, 4, 8, 16, 32, 64)  # steps of a part
+CUTS = (1, 2, 4, 8, 16, 32, 64)  # numbers of steps per part
 PLACES = 6  # states, each with its own actions
-INSIDE = 2  # looks inside the shortest steps; at random, or an oscillation might fit between them as well
+INSIDE = 2  # samples inside the shortest steps, at random, since an oscillation could fit between regular samples
 INTEGRAL, LEVEL = 2e-3, 2e-2
-WARNS = 2e-2  # of the integral, left by the shortest steps
-PULSES = 16  # shortest steps with an excursion of a level: more of them are no single pulse
+WARNS = 2e-2  # relative error of the integral with the shortest steps
+PULSES = 16  # shortest steps with an excursion of a level; more than this are not a single pulse
 
 
 @dataclasses.dataclass(frozen=True)
 class Resolution:
-    """How well steps resolve the functions of the time.
+    """The steps required by the functions of time, and the remaining errors.
 
     Attributes:
       lengths: the longest step in each part of the horizon, shape (PARTS,), from t = 0 on.
-      errors: the error of the integrals for each number of steps a part, relative, shape (len(CUTS),).
-      left: that error with these lengths.
+      errors: the relative error of the integrals for each number of steps per part, shape (len(CUTS),).
+      left: the relative error with these lengths.
       unsteady: True if the levels change faster than the shortest steps.
     """
 
@@ -51,7 +51,7 @@ class Resolution:
 
 
 def resolution(problem: Problem, grid: Grid, horizon: float, dtype: DType) -> Resolution:
-    """The steps that a problem's functions of the time need; host level."""
+    """The steps that a problem's functions of time require; host level."""
     finest = PARTS * CUTS[-1]
     ends = np.linspace(0.0, horizon, finest + 1)
     random = np.random.default_rng(0)
@@ -78,20 +78,20 @@ def resolution(problem: Problem, grid: Grid, horizon: float, dtype: DType) -> Re
 
 
 def report(found: Resolution, horizon: float, step: float | None) -> None:
-    """Warn of functions that change faster than the steps, or than the one that was given."""
+    """Warn of functions that change faster than the steps, or than the given step."""
     if step is None:
         if found.left > WARNS or found.unsteady:
             warn(
-                f"the functions of the time change faster than steps of {horizon / PARTS / CUTS[-1]:.3g}, the shortest "
-                "that are taken for them; give a shorter step=, or the mean of what oscillates"
+                f"the functions of time change faster than steps of {horizon / PARTS / CUTS[-1]:.3g}, the shortest "
+                "used for them; pass a shorter step=, or replace oscillating functions by their mean"
             )
         return
     place = sum(cut <= horizon / PARTS / step * (1 + 1e-9) for cut in CUTS) - 1
     error, shortest = float(found.errors[max(place, 0)]), float(np.min(found.lengths))
     if error > WARNS and shortest < step:
         warn(
-            f"the functions of the time change within steps of step = {step:.3g}: they are off by "
-            f"{error:.0%} of their integral; leave step out, or take at most {shortest:.3g}"
+            f"the functions of time change within steps of step = {step:.3g}: they are off by "
+            f"{error:.0%} of their integral; remove step, or use at most {shortest:.3g}"
         )
 
 
@@ -127,13 +127,13 @@ def _sample(problem: Problem, x: Array, u: Array, d: Array, times: Array) -> dic
 
 
 def _of_integral(at_ends: np.ndarray, between: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """The error of the trapezoidal rule in each part by each number of steps, over the integral of |g|."""
+    """The error of the trapezoidal rule in each part for each number of steps, relative to the integral of |g|."""
     finest, shortest = len(between), 1.0 / len(between)
-    # the trapezoidal rule on the shortest steps, and a random look at what it leaves: nothing where g is linear
+    # the trapezoidal rule on the shortest steps, and a random sample of its error, which is zero where g is linear
     shares = shares[..., None, None]
     straight = (1 - shares) * at_ends[:-1, None] + shares * at_ends[1:, None]
     means = (at_ends[1:] + at_ends[:-1]) / 2 + (between - straight).mean(axis=1)
-    # one scale for an entry in all places, or one in which it is next to nothing would decide
+    # one scale per entry over all places, otherwise a place where it nearly vanishes would dominate
     size = np.max(np.abs(means).mean(axis=0), axis=0)
     scale = np.where(size > 0, size, np.inf)
     rows = []
@@ -147,7 +147,7 @@ def _of_integral(at_ends: np.ndarray, between: np.ndarray, shares: np.ndarray) -
 
 
 def _of_level(at_ends: np.ndarray, between: np.ndarray) -> tuple[np.ndarray, int]:
-    """The largest excursion beyond both ends of a step, over the range, by part; their number in shortest steps."""
+    """The largest excursion beyond both ends of a step, relative to the range, per part; and their number."""
     finest = len(between)
     extent = max(float(np.ptp(at_ends)), float(np.ptp(between)))
     if extent == 0:
@@ -165,17 +165,17 @@ def _of_level(at_ends: np.ndarray, between: np.ndarray) -> tuple[np.ndarray, int
 
 
 def _enough_for_integrals(errors: np.ndarray) -> np.ndarray:
-    """The number of each entry of ``CUTS`` per part with which the error of the integrals is small enough."""
+    """The index into ``CUTS`` for each part with which the error of the integrals is small enough."""
     chosen, parts = np.zeros(PARTS, int), np.arange(PARTS)
     while np.sum(errors[chosen, parts]) > INTEGRAL:
         now = np.where(chosen < len(CUTS) - 1, errors[chosen, parts], 0)
-        if np.max(now) <= INTEGRAL / PARTS / 10:  # nothing is to be gained
+        if np.max(now) <= INTEGRAL / PARTS / 10:  # shorter steps do not help
             break
         chosen += now >= np.max(now) / 2
     return chosen
 
 
 def _enough_for_levels(deviations: np.ndarray) -> np.ndarray:
-    """The number of each entry of ``CUTS`` per part with which the levels are followed."""
+    """The index into ``CUTS`` for each part with which the levels are resolved."""
     good = deviations <= LEVEL
     return np.where(good.any(axis=0), np.argmax(good, axis=0), len(CUTS) - 1)

@@ -1,12 +1,12 @@
-"""``solve`` inside ``jit``, ``vmap`` and ``grad``: the answer of the host, and its derivative.
+"""``solve`` inside ``jit``, ``vmap`` and ``grad``: the solution of the host, and its derivative.
 
-What the host decides between two programs (which certificate holds, vanishing discounts, nodes from which a target can
-be forced, rest nodes that are left, linear solves where sweeps stall, the second order) would be another method if a
-compiled program had to decide it. So the program calls the host, once for all lanes of a ``vmap``, and the answer is
-that of ``solve`` to the last bit. Derivatives never see the steps: they are those of the equation that the answer
-solves, by the implicit function theorem, and are compiled.
+Between programs the host decides which certificate holds, whether to use vanishing discounts, from which nodes a target
+can be forced, which rest nodes are left, when to replace stalled sweeps by linear solves, and the order. A compiled
+program could not make these decisions with the same method. It therefore calls the host, once for all lanes of a
+``vmap``, and the result equals that from ``solve`` to the last bit. Derivatives do not involve the steps: they are the
+derivatives of the equation that the solution satisfies, by the implicit function theorem, and are compiled.
 
-Each lane runs as ``solve`` would run it, on the caller's device, in float64 unless float32 was asked for.
+Each lane runs as in ``solve``, on the caller's device, in float64 unless float32 was requested.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_ch
 from hjbjax.solvers.semi_lagrangian import finish as finish_arcs
 from hjbjax.solvers.setup import assumptions_of, check_on_one_state, choose, is_bare, prepare
 
-NOTHING = [[1.0, -np.inf], [1.0, np.inf]]  # an enclosure that says nothing
+NOTHING = [[1.0, -np.inf], [1.0, np.inf]]  # an enclosure without information
 
 
 @pytree_dataclass(static=("scheme", "max_steps", "time_limit", "throw", "dtype", "inner", "x64"))
@@ -54,9 +54,9 @@ class Asked:
     Attributes:
       method, scheme: as in ``solve``.
       max_steps, time_limit, throw: as in ``solve``.
-      dtype: of the answer, in which derivatives are found.
+      dtype: the dtype of the result and its derivatives.
       inner: the floating-point type in which the host solves.
-      x64: true if JAX knows float64 meanwhile, as the caller's functions may have been traced with it.
+      x64: True if JAX has float64 enabled meanwhile, as the caller's functions may have been traced with it.
     """
 
     method: Method | None
@@ -71,19 +71,19 @@ class Asked:
 
 @pytree_dataclass()
 class Found:
-    """What the host hands over.
+    """The result of the host.
 
     Attributes:
       value: V, (*grid), at unreachable nodes a finite number above all others.
       policy: the optimal actions, and the defect of the equation under them.
-      fixed, counted: bool (*grid), the nodes whose value is given, and those with a finite value.
-      floor: the bound below which no value was let.
+      fixed, counted: bool (*grid), the nodes with prescribed values, and those with a finite value.
+      floor: the lower bound imposed on the values.
       code, steps: as in ``Solution``.
-      sharp: true for an answer by slopes of high order.
-      enclosure: as in ``Solution``; of no meaning without a certificate.
-      monotone_error: of the monotone answer, infinite where nothing certifies it.
-      followed: true for an answer on arcs; None where there is none of this kind.
-      arc: the number of the best arc of every node, (*grid); None likewise.
+      sharp: True for a solution by high-order slopes.
+      enclosure: as in ``Solution``; meaningless without a certificate.
+      monotone_error: of the monotone solution, infinite without a certificate.
+      followed: True for a solution on arcs; None if arcs are not possible.
+      arc: the number of the best arc of every node, (*grid); None if arcs are not possible.
     """
 
     value: Any
@@ -109,7 +109,7 @@ def solve(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: 
     value, policy = _differentiable(task, on.scheme, found)
     if found.followed is not None:
         value, policy = jax.lax.cond(found.followed, lambda: _on_arcs(on, found), lambda: (value, policy))
-    # a transformation drops the code, so that a failure must show in the numbers; a derivative is NaN with its value
+    # a transformation drops the code, so a failure must show in the numbers; the derivative of NaN is NaN
     good = (found.code == Status.CONVERGED) if asked.throw else jnp.ones((), bool)
     value, policy = jax.tree.map(lambda leaf: leaf * jnp.where(good, 1, jnp.nan).astype(leaf.dtype), (value, policy))
     if task.has_lost:
@@ -129,15 +129,15 @@ def solve(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: 
 
 
 def _scheme(problem: Problem, method: Method) -> Scheme:
-    """The scheme of ``choose_scheme`` as far as the structure of a problem tells: slopes, or surely none."""
+    """The scheme of ``choose_scheme`` as far as the structure determines it: high-order slopes, or certainly none."""
     tube = is_constrained(problem) and is_discounted(problem) is False
     return Upwind() if method.relaxes or tube else Limited()
 
 
 def _task(on: Discretisation, method: Method, tol: Number, found: Found) -> Task:
-    """The task that the answer solves, with tracers among its numbers, by what the host found of its nodes."""
+    """The task that the solution solves, with tracers among its numbers, from the nodes that the host found."""
     problem, assumptions = on.problem, assumptions_of(on.chain)
-    # where the system rests, and at which cost, the host has found out
+    # the host has computed where the system rests, and at which cost
     plain = dataclasses.replace(assumptions, may_rest=False, costs_certify=False)
     task = prepare(on.chain, method=method, tol=tol, assumptions=plain)
     ends = problem.target is not None or assumptions.may_rest
@@ -147,8 +147,8 @@ def _task(on: Discretisation, method: Method, tol: Number, found: Found) -> Task
 
 
 def _differentiable(task: Task, scheme: Scheme, found: Found) -> tuple[jax.Array, Greedy]:
-    """Value and policy of the answer, as functions of the numbers in its task."""
-    # what is given is imposed anew: nodes that are unreachable stand above all others in this type
+    """Value and policy of the solution, as functions of the numbers in its task."""
+    # impose the prescribed values again: in this dtype unreachable nodes must exceed all others
     answer = dataclasses.replace(found, value=jax.lax.stop_gradient(task).impose(found.value))
 
     def by(task: Task) -> tuple[jax.Array, Greedy]:
@@ -164,7 +164,7 @@ def _differentiable(task: Task, scheme: Scheme, found: Found) -> tuple[jax.Array
 
 
 def _on_arcs(on: Discretisation, found: Found) -> tuple[jax.Array, Greedy]:
-    """Value and policy of an answer on arcs, as functions of the numbers in the problem and in the grid."""
+    """Value and policy of a solution on arcs, as functions of the numbers in the problem and in the grid."""
     on = cast(dataclasses.replace(on, scheme=Upwind()), on.dtype)
     plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
     legs = tuple(int(leg) for leg in plan.legs)
@@ -175,12 +175,12 @@ def _on_arcs(on: Discretisation, found: Found) -> tuple[jax.Array, Greedy]:
 
 
 def _may_follow(asked: Asked, problem: Problem, grid: Grid) -> bool:
-    """True if the host may answer on arcs, as far as the structure of the question tells."""
+    """True if the host may solve on arcs, as far as the structure of the problem determines it."""
     return asked.method is None and asked.scheme is None and can_replace_chain(problem, grid)
 
 
 def _on_host(asked: Asked, given: Any, on: Discretisation) -> Found:
-    """What the host finds, lane by lane where some of its arguments are batched."""
+    """The result of the host, lane by lane if some of its arguments are batched."""
     leaves, structure = jax.tree.flatten(given)
     leaves = [jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf for leaf in leaves]
     varying = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]
@@ -202,7 +202,7 @@ def _on_host(asked: Asked, given: Any, on: Discretisation) -> Found:
 
 
 def _shapes(on: Discretisation, *, may_follow: bool) -> Found:
-    """The shapes and types of what the host hands over; ``may_follow``: it may be an answer on arcs."""
+    """The shapes and dtypes of the host's result; ``may_follow``: it may be a solution on arcs."""
     shape, inputs = on.grid.shape, (on.problem.controls, on.problem.disturbances)
 
     def array(*axes: int, dtype: Any = on.dtype) -> Any:
@@ -218,7 +218,7 @@ def _shapes(on: Discretisation, *, may_follow: bool) -> Found:
 
 
 def _in_lanes(one: Callable[..., Found], arrays: tuple[np.ndarray, ...], ranks: list[int]) -> Found:
-    """The answers of all lanes, with their axes in front; side by side where there is more than one core."""
+    """The results of all lanes, with their axes in front; in parallel if there are several cores."""
     fronts = [array.shape[: array.ndim - rank] for array, rank in zip(arrays, ranks, strict=True)]
     front = np.broadcast_shapes(*fronts)
     rows = [np.broadcast_to(array, front + array.shape[len(own) :]) for array, own in zip(arrays, fronts, strict=True)]
@@ -229,7 +229,7 @@ def _in_lanes(one: Callable[..., Found], arrays: tuple[np.ndarray, ...], ranks: 
         with settings():
             return one(*(row[index] for row in rows))
 
-    found = [one(*(row[index] for row in rows)) for index in lanes[:1]]  # on its own: it compiles for the others
+    found = [one(*(row[index] for row in rows)) for index in lanes[:1]]  # first on its own, to compile for the others
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if cores > 1 and len(lanes) > 2:
         with ThreadPoolExecutor(cores) as pool:
@@ -242,7 +242,7 @@ def _in_lanes(one: Callable[..., Found], arrays: tuple[np.ndarray, ...], ranks: 
 def _solved(
     asked: Asked, problem: Problem, grid: Grid, method: Method | None, guess: Nodes | None, tol: Number
 ) -> Found:
-    """The answer of one lane, in NumPy; its warnings stay here, as no line of the user's runs now."""
+    """The result of one lane, in NumPy; its warnings are dropped, because the user's line is not on the stack."""
     clock = Clock(asked.max_steps or 10**9, asked.time_limit, progress=False)
     with own_settings(x64=asked.x64), keeping_warnings():
         grid.check_spacings(asked.inner)
@@ -282,7 +282,7 @@ def _solved(
 
 
 def _found_on_arcs(followed: Followed) -> Found:
-    """An answer on arcs, in NumPy."""
+    """A solution on arcs, in NumPy."""
     solution, task, state = finish_arcs(followed), followed.task, jax.device_get(followed.state)
     counted = np.asarray(task.counted)
     policy: Any = np.where(np.isnan(solution.policy), 0, solution.policy)
@@ -304,7 +304,7 @@ def _found_on_arcs(followed: Followed) -> Found:
 
 
 def _whole(policy: Greedy, problem: Problem) -> Greedy:
-    """The policy with an array of zeros for every action that was not kept."""
+    """The policy with an array of zeros for every action that was not stored."""
     kept: list[tuple[Any, ...]] = []
     for actions, admissible in (
         (policy.controls, problem.controls),

@@ -1,7 +1,8 @@
-"""The start of an undiscounted solve: the answers for a discount that vanishes.
+"""The start of an undiscounted solve: the solutions for vanishing discounts.
 
-From zero, an undiscounted problem is full of policies that stay where they are, at a cost. Those of a small discount
-move to the target. A stopping cost or a running maximum is itself a start: ψ lies above all fixed points, g below.
+Near zero, an undiscounted problem is full of policies that stay where they are, at a cost. With a small discount
+policies move to the target. A stopping cost or a running maximum is a start itself: ψ is above all fixed points, g
+below.
 """
 
 import jax.numpy as jnp
@@ -14,13 +15,13 @@ from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import Clock
 from hjbjax.solvers.stationary_run import iterate
 
-VANISHING = (2.0, 0.2, 0.02)  # discounts, over one by the time that crossing the box takes
-FURTHER = ((2e-3, 2e-4), (2e-5, 2e-6), (2e-7, 2e-8))  # where parts of the box are that much slower than the fastest
-WARM_STEPS = 60  # improvements under each discount, at most: the last answer is only a guess
+VANISHING = (2.0, 0.2, 0.02)  # discounts, in units of one over the time to cross the box
+FURTHER = ((2e-3, 2e-4), (2e-5, 2e-6), (2e-7, 2e-8))  # for parts of the box that are that much slower than the fastest
+WARM_STEPS = 60  # largest number of improvements per discount, as the last value is only a guess
 
 
 def warm(task: Task, guess: Nodes | None, clock: Clock) -> Nodes:
-    """The guess; without one zero, or without discount a start that leads to the right one of many fixed points."""
+    """The guess, or without one zero, or without discount a start that leads to the right one of many fixed points."""
     if guess is not None:
         return guess
     value = task.start() if task.constrained else jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))
@@ -28,18 +29,18 @@ def warm(task: Task, guess: Nodes | None, clock: Clock) -> Nodes:
 
 
 def needs_a_way(task: Task) -> bool:
-    """True if the iteration from zero may be caught by policies that stay where they are, at a cost."""
+    """True if the iteration from zero may be trapped by policies that stay where they are, at a cost."""
     return task.certificate is Certificate.MULTIPLICATIVE and not task.constrained
 
 
 def follow(task: Task, value: Nodes, discounts: tuple[float, ...], clock: Clock) -> Nodes:
-    """The last of the answers for these discounts, over one by the time of a crossing, each from the one before."""
+    """The solution for the last of these discounts, over the crossing time, each started from the one before."""
     for discount in discounts:
         value = iterate(under(task, discount), value, clock, most=WARM_STEPS)[0].value
     return value
 
 
 def under(task: Task, discount: float) -> Task:
-    """The task under a discount, over one by the time of a crossing."""
-    # only the number changes: with the same structure and certificate the program of the solve itself serves
+    """The task with a discount in units of one over the crossing time."""
+    # only a number changes: with the same structure and certificate the program of the solve itself is reused
     return task.asking(altered(task.problem, discount=np.asarray(discount / known(task.crossing), task.tol.dtype)))

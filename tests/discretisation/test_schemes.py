@@ -97,7 +97,7 @@ def test_what_a_scheme_of_ones_own_cannot_do_is_said():
     stretched = hjb.Grid([-1.0], [1.0], (20,), stretch=(hjb.Sinh(2.0),))
     for ask in (lambda: hjb.solve(problem, stretched, scheme=Minmod()),
                 lambda: hjb.march(free, stretched, 1.0, scheme=Minmod())):  # fmt: skip
-        with pytest.raises(ValueError, match=r"Minmod\(.*\) wants equal spacings"):
+        with pytest.raises(ValueError, match=r"Minmod\(.*\) requires equal spacings"):
             ask()
     with pytest.raises(TypeError, match=r"Eno2\(\); wanted hjb.Upwind"):
         hjb.solve(problem, grid, scheme=hjb.Eno2())
@@ -204,7 +204,7 @@ def test_a_chain_that_is_none_is_refused_by_what_it_lacks():
         hjb.solve(problem, grid, scheme=Slopes())
     with pytest.raises(TypeError, match="whose chain None is not derived from"):
         hjb.march(problem, grid, 0.1, scheme=Chainless())
-    with pytest.raises(TypeError, match="or one of your own, derived from hjbjax.discretisation.schemes.Scheme"):
+    with pytest.raises(TypeError, match="or a custom one derived from hjbjax.discretisation.schemes.Scheme"):
         hjb.solve(problem, grid, scheme=Slopes)
 
 

@@ -107,7 +107,7 @@ def test_enumerated_controls_are_members_and_marched_values_are_asked_at_the_tim
     assert greedy(np.array([0.0, 1.0]), np.array([[0.31], [0.31]])).tolist() == [[1.0], [-1.0]]
     batched = jax.jit(jax.vmap(lambda t, x: greedy(t, x)))(jnp.array([0.1, 0.9]), jnp.array([[-0.4], [-0.4]]))
     assert batched.tolist() == [[-1.0], [1.0]]
-    with pytest.warns(UserWarning, match="lie outside the kept ones"):
+    with pytest.warns(UserWarning, match="lie outside the kept times"):
         assert np.isnan(greedy.control_at(2.0, [0.31])).all()
 
 

@@ -175,7 +175,9 @@ def test_a_failing_condition_of_isaacs_is_told_beside_what_the_actions_matter(si
         lambda x, u, d: -x, jax.tree_util.Partial(differing, np.array([30.0, 1.0]) * size),
         PAIR, disturbances=PAIR, discount=1.0,
     )  # fmt: skip
-    with pytest.warns(hjb.SolveWarning, match=r"Isaacs condition fails.*100% of what the actions matter") as caught:
+    with pytest.warns(
+        hjb.SolveWarning, match=r"Isaacs condition fails.*100% of the influence of the actions"
+    ) as caught:
         solution = hjb.solve(problem, LINE, tol=1e-3 * size, scheme=hjb.Upwind())
     assert caught[0].filename == __file__
     assert solution.isaacs_gap == pytest.approx((1 - np.cos(6)) * size, rel=1e-6)

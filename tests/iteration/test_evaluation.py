@@ -191,7 +191,7 @@ def test_what_is_no_evaluation_is_refused(evaluation):
 
 
 def test_an_evaluation_that_is_no_pytree_is_told_how_to_become_one():
-    with pytest.raises(TypeError, match=r"Unregistered is no pytree.*\n?.*jax.tree_util.register_static"):
+    with pytest.raises(TypeError, match=r"Unregistered is not a pytree.*\n?.*jax.tree_util.register_static"):
         hjb.PolicyIteration(Unregistered())
 
 

@@ -379,7 +379,7 @@ def test_two_nodes_on_a_periodic_axis():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"controls": Box([-1.0], [1.0])}, "controls in a Box, wanted Finite: sample it, as by Box.grid(num)"),
+        ({"controls": Box([-1.0], [1.0])}, "controls in a Box, wanted Finite: sample it, e.g. Box.grid(num)"),
         ({"controls": Ball(1.0, 1)}, "controls in a Ball"),
         ({"discount": 0.0}, "discount = 0, wanted > 0"),
         ({"stopping_cost": 1.0}, "stopping_cost"),

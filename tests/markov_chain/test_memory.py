@@ -202,7 +202,7 @@ def test_limits_that_are_no_number_of_bytes(bad):
 
 
 def test_hardly_any_memory():
-    with pytest.raises(MemoryError, match="Not even two points an axis would fit in 2-D"):
+    with pytest.raises(MemoryError, match="Not even two points per axis would fit in 2-D"):
         memory.require(PROBLEM, square(10), METHODS[0], np.float64, 7.5)
 
 

@@ -105,7 +105,7 @@ def test_correlated_noise_is_refused_with_a_shape_that_does(sigma):
 
 def test_correlated_noise_whose_ratio_no_shape_of_this_box_has():
     sigma = np.array([[1.0], [np.sqrt(3.0)]])
-    refused("values", r"(?s)spacings are as \[1, 1.73205\] to one another", noise=sigma)
+    refused("values", r"(?s)spacings have the ratios \[1, 1.73205\]", noise=sigma)
     accepted(noise=sigma, grid=Grid([0.0, 0.0], [1.0, np.sqrt(3.0)], (6, 6)))
 
 
@@ -114,7 +114,7 @@ def test_correlated_noise_at_some_nodes():
         return jnp.stack([jnp.stack([x[0], 0.0]), jnp.stack([x[1], 0.1])])
 
     # near x₀ = 0 the noise of the second axis is all that is left of a, so that no spacing does at all nodes
-    refused("values", r"(?s)24 of 45 nodes.*No spacings were found that do at all nodes", noise=noise)
+    refused("values", r"(?s)24 of 45 nodes.*No spacings were found that satisfy this at all nodes", noise=noise)
 
 
 def spread(a, now):
@@ -146,13 +146,13 @@ def test_coordinates_of_another_problem_are_not_advised():
     def noise(x, u):
         return jnp.stack([jnp.stack([x[0], 0.0]), jnp.stack([0.5 * x[0] * x[1], 0.5])])
 
-    refused("values", r"(?s)all nodes. Turn the", grid=Grid([0.5, 0.1], [4.0, 1.0], (11, 11)), noise=noise)
+    refused("values", r"(?s)all nodes. Rotate the", grid=Grid([0.5, 0.1], [4.0, 1.0], (11, 11)), noise=noise)
 
 
 def test_three_strong_correlations_are_beyond_any_spacing():
     grid = Grid([0.0] * 3, [1.0] * 3, (5, 6, 7))
     strong, weak = (np.linalg.cholesky((1 - r) * np.eye(3) + r) for r in (0.9, 0.3))
-    refused("values", r"(?s)No spacing of these axes", grid=grid, drift=lambda x, u: x, noise=strong)
+    refused("values", r"(?s)No spacings of these axes", grid=grid, drift=lambda x, u: x, noise=strong)
     accepted(grid=grid, drift=lambda x, u: x, noise=weak)
 
 

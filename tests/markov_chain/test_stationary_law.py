@@ -181,7 +181,7 @@ def test_the_bound_on_rounding_holds_where_wells_hardly_exchange():
     ("changes", "reason"),
     [
         ({"target": lambda x: x[0]}, r"a problem with a target, where paths end"),
-        ({"noise": 0.3}, r"rounding alone may move 0.00\d+ of the probability between them, wanted at most 1e-06"),
+        ({"noise": 0.3}, r"rounding may move 0.00\d+ of the probability between them, wanted at most 1e-06"),
         ({"noise": None}, r"got 3 recurrent classes, wanted one.*\n.*states \[-1.\] and \[0.\], 1 and 1 nodes"),
     ],
 )

@@ -49,7 +49,7 @@ def trouble():
 def broken(caught, words="my own trouble"):
     error = caught.value
     assert words in str(error)
-    assert any("It came as far as" in note for note in error.__notes__)
+    assert any("It stopped during" in note for note in error.__notes__)
     assert error.solution.status is Status.INTERRUPTED
     return error.solution
 

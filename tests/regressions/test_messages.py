@@ -80,7 +80,7 @@ def test_a_discount_that_is_next_to_nothing(discount):
 
 @pytest.mark.parametrize("given", [problem(), None, 3])
 def test_a_batch_is_a_list(given):
-    with pytest.raises(TypeError, match=r"solve_batch: got .*; wanted a list of problems, as in \[problem\]"):
+    with pytest.raises(TypeError, match=r"solve_batch: got .*; wanted a list of problems, such as \[problem\]"):
         hjb.solve_batch(given, GRID, scheme=hjb.Upwind())
 
 
@@ -236,7 +236,7 @@ def test_functions_of_another_shape_are_refused_where_nothing_else_would_tell():
         (lambda: hjb.estimate(GRID, problem()), "estimate: got Grid, Problem; wanted a Problem and a Grid"),
         (lambda: hjb.chain.generator(GRID, problem()), "generator: got Grid, Problem; wanted a Problem and a Grid"),
         (lambda: hjb.attenuation(GRID, 1.0, U), "attenuation: got Grid, wanted a Problem"),
-        (lambda: hjb.solve_batch([problem(), 3], GRID), "solve_batch: lane 1 is 3; wanted problems alone"),
+        (lambda: hjb.solve_batch([problem(), 3], GRID), "solve_batch: lane 1 is 3; wanted only problems"),
         (lambda: hjb.Grid([0.0], [1.0], (3,), stretch="sinh"), "Grid.stretch: got 'sinh', wanted one entry per axis"),
         (
             lambda: hjb.Grid([0.0], [1.0], (3,), stretch=hjb.Sinh(3.0)),

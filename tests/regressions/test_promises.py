@@ -199,6 +199,6 @@ def test_a_filter_wants_a_tube():
 
 def test_a_time_that_was_not_kept_is_told():
     solution = hjb.Solution(LINE, np.zeros((2, 161)), np.zeros((2, 161, 1)), times=np.array([0.0, 1.0]))
-    with pytest.warns(UserWarning, match="1 of 2 times lie outside the kept ones, from 0 to 1"):
+    with pytest.warns(UserWarning, match="1 of 2 times lie outside the kept times, from 0 to 1"):
         assert np.isnan(solution.value_at([0.5, 1.5], [[0.0], [0.0]])).tolist() == [False, True]
     assert solution.value_at(1.5, [0.0], clamp=True) == 0

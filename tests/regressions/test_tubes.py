@@ -142,7 +142,7 @@ def test_a_slow_spiral_is_followed_to_its_end():
 @pytest.mark.parametrize("make", [reach, avoid])
 def test_a_guess_between_the_fixed_points_of_a_tube_is_refused(make):
     """Zero is itself a fixed point, and would stay."""
-    with pytest.raises(ValueError, match="leave out guess"):
+    with pytest.raises(ValueError, match="remove guess"):
         hjb.solve(make(0.5), GRID, guess=np.zeros(GRID.shape), scheme=hjb.Upwind())
 
 

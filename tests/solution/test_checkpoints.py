@@ -207,11 +207,11 @@ def test_the_file_of_another_question_is_refused(tmp_path):
 def test_what_stands_in_the_way_is_said_before_anything_is_computed(tmp_path):
     path = tmp_path / "run.npz"
     path.write_bytes(b"")
-    with pytest.raises(FileExistsError, match=r"^solve: .*there is a checkpoint already; resume=True goes on from it"):
+    with pytest.raises(FileExistsError, match=r"^solve: .*there is a checkpoint already; pass resume=True to continue"):
         hjb.solve(posed(), LINE, checkpoint=path)
     with pytest.raises(hjb.FileError, match="^solve: .*run.npz: cannot be read: it is empty"):
         hjb.solve(posed(), LINE, checkpoint=path, resume=True)
-    with pytest.raises(ValueError, match="resume=True goes on from a checkpoint; give checkpoint="):
+    with pytest.raises(ValueError, match="resume=True continues from a checkpoint; pass checkpoint="):
         hjb.solve(posed(), LINE, resume=True)
     with pytest.raises(hjb.FileError, match=r"^solve: .*run.npz: cannot be written: there is no folder .*missing$"):
         hjb.solve(posed(), LINE, checkpoint=tmp_path / "missing" / "run")

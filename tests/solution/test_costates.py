@@ -102,7 +102,7 @@ def test_of_a_marched_solution_and_under_transformations():
     values = np.stack([(1 + t) * (PLAIN.nodes()[..., 0] ** 2 + PLAIN.nodes()[..., 1]) for t in times])
     marched = Solution(PLAIN, values, np.zeros((*values.shape, 1)), code=1, times=times)
     np.testing.assert_allclose(marched.costate_at(1.25, [0.3, 1.0]), 2.25 * np.array([0.6, 1.0]))
-    with pytest.warns(UserWarning, match="lie outside the kept ones"):
+    with pytest.warns(UserWarning, match="lie outside the kept times"):
         assert np.all(np.isnan(marched.costate_at(3.0, [0.3, 1.0])))
     with pytest.raises(ValueError, match=r"marched over times: call costate_at\(t, x\)"):
         marched.costate_at([0.3, 1.0])

@@ -148,7 +148,7 @@ def test_what_cannot_be_written(tmp_path):
 def test_what_is_no_name_of_a_file(name):
     for done, ask in (("written", example().save), ("read", load)):
         with pytest.raises(
-            FileError, match=f"cannot be {done}: (it is no path|there is a null byte|the system has no bytes)"
+            FileError, match=f"cannot be {done}: (it is not a path|there is a null byte|the system cannot encode)"
         ):
             ask(name)
 
@@ -302,7 +302,7 @@ def test_every_truncation_is_refused(tmp_path):
     data = good(path)
     for length in {*range(1, 8), *range(8, len(data), 41), *range(len(data) - 30, len(data))}:
         path.write_bytes(data[:length])
-        refused(path, "truncated|no npz file|damaged")
+        refused(path, "truncated|not an npz file|damaged")
 
 
 @pytest.mark.slow
@@ -346,7 +346,7 @@ def test_foreign_files(tmp_path):
     path = tmp_path / "run.npz"
     for name, data in {"text": b"hello, this is text", "npy": npy("{}"), "zeros": bytes(4096)}.items():
         (tmp_path / name).write_bytes(data)
-        refused(tmp_path / name, "it is no npz file")
+        refused(tmp_path / name, "it is not an npz file")
     np.savez(path, value=np.zeros((4, 3)))
     refused(path, "it has no header")
     np.savez(path, header=np.zeros(3))

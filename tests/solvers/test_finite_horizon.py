@@ -78,7 +78,7 @@ def test_four_stages_take_steps_twice_as_long():
 
 @pytest.mark.parametrize(
     ("means", "euler", "word"),
-    [((), 1.0, "one number a stage"), ((0.0, 1.0), 1.0, "below 1"), ((0.0, -0.1), 1.0, "from 0"),
+    [((), 1.0, "one number per stage"), ((0.0, 1.0), 1.0, "below 1"), ((0.0, -0.1), 1.0, "from 0"),
      ((0.0, 0.5), 0.5, "last stage ends at 0.5 of a step"), ((0.0,), 2.0, "at most 1")],
 )  # fmt: skip
 def test_what_is_no_tableau_is_refused(means, euler, word):

@@ -45,7 +45,7 @@ LQ = hjb.Problem(plane, quadratic, Box([-3.0], [3.0]))
         ({"scheme": "weno"}, TypeError, r"scheme is 'weno'; wanted hjb.Upwind\(\)"),
         ({"method": "implicit"}, TypeError, r"method is 'implicit'"),
         ({"method": hjb.Implicit(), "scheme": hjb.Weno5()}, ValueError, r"got Weno5\(.*\), wanted Upwind"),
-        ({"inner": 2.0}, ValueError, r"inner = 2.0; wanted the share"),
+        ({"inner": 2.0}, ValueError, r"inner = 2.0; wanted the fraction"),
         ({"inner": 0.5}, ValueError, r"watches a Box of disturbances; got None"),
         ({"time_limit": 0}, ValueError, r"time_limit = 0"),
         ({"dtype": "float16"}, ValueError, r"dtype: got 'float16'"),
@@ -54,7 +54,7 @@ LQ = hjb.Problem(plane, quadratic, Box([-3.0], [3.0]))
         (
             {"grid": hjb.Grid([-2.0], [2.0], (41,), stretch=(hjb.Sinh(2.0),)), "scheme": hjb.Eno2()},
             ValueError,
-            r"Eno2\(\) wants equal spacings",
+            r"Eno2\(\) requires equal spacings",
         ),
     ],
 )
@@ -147,7 +147,7 @@ def test_times_and_what_they_hold(tmp_path):
     assert again.value_at(0.65, [0.5]) == solution.value_at(0.65, [0.5])
     between = (solution.value_at(0.3, [0.5]) + solution.value_at(1.0, [0.5])) / 2
     assert solution.value_at(0.65, [0.5]) == pytest.approx(between, rel=1e-12)
-    with pytest.warns(UserWarning, match="lie outside the kept ones"):
+    with pytest.warns(UserWarning, match="lie outside the kept times"):
         assert np.isnan(solution.value_at(1.5, [0.5]))
     assert solution.value_at(1.5, [0.5], clamp=True) == solution.value_at(1.0, [0.5])
     several = solution.value_at([0.0, 0.3], [[0.5], [-0.5]])
@@ -196,7 +196,7 @@ def test_it_can_be_compiled_batched_and_differentiated():
 
 
 def test_traced_use_wants_a_step():
-    with pytest.raises(ValueError, match=r"inside jit, vmap and grad the number of steps must be known: give step="):
+    with pytest.raises(ValueError, match=r"inside jit, vmap and grad the number of steps must be known: pass step="):
         jax.jit(lambda weight: at_one(weight, step=None))(1.0)
     with pytest.raises(ValueError, match=r"horizon and times set the number of steps and must be known"):
         jax.jit(lambda horizon: hjb.march(LQ, GRID, horizon, step=0.01, scheme=hjb.Upwind(split=True)).value)(1.0)

@@ -190,7 +190,7 @@ def test_refusals(found):
         "host": ("ValueError: solve: a function of the problem calls Python on the host", "leave out mesh"),
         "no mesh of lanes": ("TypeError: solve_batch: mesh is 8", "jax.make_mesh"),
         "lanes to a file": (
-            "ValueError: solve_batch: lanes over the devices of a mesh have no checkpoint",
+            "ValueError: solve_batch: checkpoint= is not supported together with mesh=",
             "leave out",
         ),
         "lanes by the host": ("ValueError: solve_batch: a function of the problem calls Python on", "leave out mesh"),

@@ -305,7 +305,7 @@ REFUSED = {
         lambda: hjb.solve(rest(), hjb.Grid([-1.0], [1.0], (11,), edges="constrained"), scheme=hjb.SemiLagrangian()),
         "constrained ends",
     ),
-    "rest points": (lambda: hjb.solve(rest(discount=0.0), LINE, scheme=hjb.SemiLagrangian()), "wants a target"),
+    "rest points": (lambda: hjb.solve(rest(discount=0.0), LINE, scheme=hjb.SemiLagrangian()), "requires a target"),
     "costs that vanish": (
         lambda: hjb.solve(
             hjb.Problem(slide, lambda x, u: jnp.maximum(x[0], 0), ONE, target=lambda x: near(x - 0.6)), LINE,
@@ -321,7 +321,7 @@ REFUSED = {
     ),
     "other methods": (
         lambda: hjb.solve(rest(), LINE, scheme=hjb.SemiLagrangian(), method=hjb.PolicyIteration(hjb.Krylov())),
-        "no matrix",
+        "not have a matrix",
     ),
     "coarser grids": (lambda: hjb.solve(rest(), LINE, scheme=hjb.SemiLagrangian(), method=hjb.Nested()), "one grid"),
     "transformations": (

@@ -136,7 +136,7 @@ def test_it_goes_on_from_a_checkpoint_and_lane_by_lane(tmp_path):
     ids=["time", "rest"],
 )
 def test_where_v_alone_tells_no_bound_it_is_refused(problem):
-    with pytest.raises(ValueError, match=r"ValueIteration\(policy=False\) keeps V alone.*give discount > 0"):
+    with pytest.raises(ValueError, match=r"ValueIteration\(policy=False\) stores only V.*Use discount > 0"):
         hjb.solve(problem, PLANE, method=BARE)
 
 

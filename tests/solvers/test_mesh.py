@@ -189,10 +189,7 @@ def test_refusals(found):
         "traced march": ("ValueError: march: mesh divides the nodes at host level only", "jit"),
         "host": ("ValueError: solve: a function of the problem calls Python on the host", "leave out mesh"),
         "no mesh of lanes": ("TypeError: solve_batch: mesh is 8", "jax.make_mesh"),
-        "lanes to a file": (
-            "ValueError: solve_batch: checkpoint= is not supported together with mesh=",
-            "leave out",
-        ),
+        "lanes to a file": ("ValueError: solve_batch: checkpoint= is not supported together with mesh=", "only one"),
         "lanes by the host": ("ValueError: solve_batch: a function of the problem calls Python on", "leave out mesh"),
         "direct lanes": ("ValueError: solve_batch: PolicyIteration(evaluation=Direct()", "leave out mesh"),
     }

@@ -151,7 +151,7 @@ class Discretisation:
     cut: tuple[Links, ...] | None = None
     mesh: Mesh | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # jnp.float32 and "float32" hash differently from np.dtype, so each would compile its own program
         object.__setattr__(self, "dtype", np.dtype(self.dtype))
 

@@ -88,7 +88,7 @@ class SemiLagrangian:
     actions: int = 64
     points, in_parts = 2, False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         arguments.count(self.cells, "SemiLagrangian: cells")
         arguments.count(self.actions, "SemiLagrangian: actions")
 

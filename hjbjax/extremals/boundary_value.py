@@ -197,7 +197,7 @@ class BoundaryValueProblem:
         controls, weights = self.mixture(t, x, p, corner)
 
         # u is constant in H_x: its own derivative contributes nothing, because H_u = 0 or u is at a fixed bound
-        def one(u):
+        def one(u: Control) -> jax.Array:
             here = self.wrap(x)
             drift = jnp.asarray(self.problem.drift(*self.problem.arguments(here, u, t=t)), p.dtype)
             slope = jax.grad(self.hamiltonian, 1)(t, x, p, u)

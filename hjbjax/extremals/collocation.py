@@ -88,7 +88,7 @@ def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limit
         unit, rows = units_of(bvp, guess, slopes, missed, sought)
     column = unit[:, None]
 
-    def function(s, y, theta=nothing):
+    def function(s: np.ndarray, y: np.ndarray, theta: np.ndarray = nothing) -> np.ndarray:
         nonlocal last
         y = y * column
         if s[0] == 0 and s[-1] == 1:  # the mesh itself, not the points between its nodes
@@ -96,7 +96,9 @@ def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limit
         limits.clock.look()
         return np.asarray(_rates(arrays, *pad_mesh(s, y), theta))[:, : len(s)] / column
 
-    def function_slopes(s, y, theta=nothing):
+    def function_slopes(
+        s: np.ndarray, y: np.ndarray, theta: np.ndarray = nothing
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         limits.clock.look()
         # copies, because SciPy modifies the derivatives in place, and JAX arrays are read-only
         by_state, by_theta = _slopes(arrays, *pad_mesh(s, y * column), theta)
@@ -104,10 +106,10 @@ def collocate(bvp: BoundaryValueProblem, s: Array, y: Array, theta: Array, limit
         by_theta = np.array(by_theta)[..., : len(s)] / column[..., None]
         return (by_state, by_theta) if len(theta) else by_state
 
-    def ends(first, last, theta=nothing):
+    def ends(first: np.ndarray, last: np.ndarray, theta: np.ndarray = nothing) -> np.ndarray:
         return np.asarray(_conditions(arrays, first * unit, last * unit, theta)) / rows
 
-    def end_slopes(first, last, theta=nothing):
+    def end_slopes(first: np.ndarray, last: np.ndarray, theta: np.ndarray = nothing) -> tuple[np.ndarray, ...]:
         by_first, by_last, by_theta = _condition_slopes(arrays, first * unit, last * unit, theta)
         scaled = (np.asarray(by_first) * unit, np.asarray(by_last) * unit, np.asarray(by_theta))
         parts = tuple(part / rows[:, None] for part in scaled)

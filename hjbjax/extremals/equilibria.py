@@ -17,7 +17,7 @@ import numpy as np
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Rest
 from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.sets import Ball, Box
-from hjbjax.problem.types import Array, Costate, State
+from hjbjax.problem.types import Array, Control, Costate, State
 
 NEAR = 1e-8  # relative to the terms of ẋ and ṗ: smaller rates count as rest
 FREE_OF_CHARGE = 1e-10  # relative to L: a smaller cost at rest counts as zero; rest points are found to about 1e-13
@@ -40,10 +40,10 @@ def _expansion(bvp: BoundaryValueProblem, x: State, p: Costate) -> dict[str, jax
     problem = bvp.problem
     u = pointwise.minimiser(problem, bvp.rule, 0.0, bvp.wrap(x), p)
 
-    def energy(x, u):
+    def energy(x: State, u: Control) -> jax.Array:
         return bvp.hamiltonian(0.0, x, p, u)
 
-    def drift(x, u):
+    def drift(x: State, u: Control) -> jax.Array:
         return jnp.asarray(problem.drift(*problem.arguments(bvp.wrap(x), u)), p.dtype)
 
     # at fixed u, because the Riccati equation minimises over u itself

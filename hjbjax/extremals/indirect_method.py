@@ -47,7 +47,7 @@ class FreeTime:
 
     guess: Number = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if np.ndim(self.guess) or not (np.isfinite(self.guess) and self.guess > 0):
             raise ValueError(f"FreeTime: got guess = {self.guess!r}, wanted a finite number > 0")
 

@@ -72,10 +72,10 @@ def into_rest(bvp: BoundaryValueProblem, start: State, duration: float, clock: C
     assert rest is not None
     times, far = np.linspace(0, duration, COLUMNS), FAR * (1 + np.linalg.norm(start))
 
-    def away(t, x):
+    def away(t: float, x: np.ndarray) -> np.floating:
         return np.linalg.norm(x) - far
 
-    def flow(t, x):
+    def flow(t: float, x: np.ndarray) -> np.ndarray:
         clock.look()
         return np.asarray(_rest_loop(arrays, x))
 
@@ -186,7 +186,7 @@ def _corners(bvp: BoundaryValueProblem) -> jax.Array:
 def _dominant_value(bvp: BoundaryValueProblem, times: Array, columns: Array) -> jax.Array:
     """The index of the value with the largest weight at every time."""
 
-    def one(t, z):
+    def one(t: Array, z: Array) -> jax.Array:
         x, p, _ = bvp.split(z)
         return jnp.argmax(bvp.mixture(t, x, p, bvp.arcs[0])[1])
 
@@ -203,7 +203,7 @@ def hamiltonian_size(bvp: BoundaryValueProblem, times: np.ndarray, columns: np.n
 def _sizes(bvp: BoundaryValueProblem, times: Array, columns: Array) -> jax.Array:
     """The larger of the spread and the mean size of H over the values of the jumping inputs, at every time."""
 
-    def one(t, z):
+    def one(t: Array, z: Array) -> jax.Array:
         x, p, _ = bvp.split(z)
         values = pointwise.corners(bvp.problem, bvp.rule)
         energies = jax.vmap(
@@ -302,7 +302,7 @@ def _free_time(bvp: BoundaryValueProblem, x: State, t: Array, nu: Array) -> jax.
     paid, waiting = jax.value_and_grad(bvp.psi, 0)(t, x)
     sliding = jax.grad(bvp.level, 0)(t, x)
 
-    def one(nu):
+    def one(nu: Array) -> jax.Array:
         p = _end_of(bvp, x, t, nu)[0]
         u = pointwise.minimiser(bvp.problem, bvp.rule, t, bvp.wrap(x), p)
         return bvp.hamiltonian(t, x, p, u) - bvp.problem.discount * paid + waiting + nu * sliding
@@ -317,8 +317,8 @@ def _paths(bvp: BoundaryValueProblem, tried: Array, times: Array) -> tuple[jax.A
     def drift(t: Array, x: State, u: Control) -> jax.Array:
         return jnp.asarray(bvp.problem.drift(*bvp.problem.arguments(bvp.wrap(x), u, t=t)), x.dtype)
 
-    def path(u):
-        def step(x, span):
+    def path(u: Control) -> tuple[jax.Array, jax.Array]:
+        def step(x: State, span: jax.Array) -> tuple[State, State]:
             t, h = span[0], span[1] - span[0]
             k1 = drift(t, x, u)
             k2 = drift(t + h / 2, x + h / 2 * k1, u)

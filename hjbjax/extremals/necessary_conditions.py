@@ -16,7 +16,7 @@ from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, samples
 from hjbjax.problem.streams import encodable
-from hjbjax.problem.types import Array, Number
+from hjbjax.problem.types import Array, Control, Number
 from hjbjax.solution.status import Status
 
 EMPTY = 1e-9  # fraction of the time below which an arc is removed from the path
@@ -95,7 +95,7 @@ def measure(bvp: BoundaryValueProblem, t: Array, z: Array, corner: Array) -> dic
     assert controls is not None
     tried = jnp.asarray(samples(controls, BUDGET), z.dtype)
 
-    def one(t, z):
+    def one(t: Array, z: Array) -> dict[str, jax.Array]:
         x, p, w = bvp.split(z)
         at, weights = bvp.mixture(t, x, p, corner)
         u = weights @ at
@@ -321,7 +321,7 @@ def _curvature(bvp: BoundaryValueProblem) -> tuple[Array, Array, Array]:
     # shift the samples, because kinks are likely at zero and at the middle of the set
     tried = middle + (tried - middle) * 0.917 + 0.0123 * width
 
-    def energy(u):
+    def energy(u: Control) -> jax.Array:
         return bvp.hamiltonian(0.0, x, jnp.ones_like(x), u)
 
     bends = jax.vmap(jax.hessian(energy))(tried)  # (samples, m, m)

@@ -23,7 +23,7 @@ in the step. The boundary of the box is only tested at the ends of steps.
 
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -403,11 +403,16 @@ def _bisection() -> type:
     import optimistix
 
     class Bisection(optimistix.Bisection):  # the arguments are optimistix's
-        def terminate(self, fn, y, args, options, state, tags):
+        def terminate(
+            self, fn: Any, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
+        ) -> tuple[jax.Array, Any]:
             narrow = jnp.abs(state.lower - state.upper) < self.atol + self.rtol * jnp.abs(y)
             return narrow, optimistix.RESULTS.successful
 
-        def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        def postprocess(
+            self, fn: Any, y: Any, aux: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object],
+            result: Any,
+        ) -> tuple[jax.Array, Any, dict[str, Any]]:  # fmt: skip
             return state.upper, aux, {}
 
     return Bisection

@@ -341,7 +341,9 @@ def bridging(kind: type) -> type:
     class Bridging(kind):
         flag: Any = None  # a field after the base class's fields needs a default
 
-        def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        def step(
+            self, terms: Any, t0: Number, t1: Number, y0: jax.Array, args: Any, solver_state: Any, made_jump: Any
+        ) -> tuple[jax.Array, Any, dict[str, Any], Any, Any]:
             y1, error, dense, state, result = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
             y1 = y1.at[-1].set(self.flag(t0, t1, y0, y1, args))
             # the event is located on the straight line between the ends, the interpolant of both of these solvers

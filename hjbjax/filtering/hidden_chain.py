@@ -23,7 +23,7 @@ from hjbjax.filtering.beliefs import Sensor, chain_functions, check_generator
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_jax, as_partial, cast, front_door, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.settings import own_settings
-from hjbjax.problem.types import Array, Control, Key, Number, Numbers
+from hjbjax.problem.types import Array, Control, Key, Number, Numbers, Scalar
 
 TERMS = 19  # of the Taylor series: 1/19! is below the rounding of float64 if q dt ≤ 1
 
@@ -44,14 +44,15 @@ def transition_matrix(rates: Array, dt: Number) -> jax.Array:
     one = jnp.eye(rates.shape[0], dtype=rates.dtype)
     raised = jnp.maximum(rates + fastest * one, 0) * short  # the smallest diagonal entry is zero up to rounding
 
-    def add(k, carry):
+    def add(k: Scalar, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         total, term = carry
         term = term @ raised / k
         return total + term, term
 
     total, _ = jax.lax.fori_loop(1, TERMS, add, (one, one))
 
-    def normal(matrix):  # replaces the factor e^{−q dt}, and keeps rounding from growing with the squarings
+    # replaces the factor e^{−q dt}, and keeps rounding from growing with the squarings
+    def normal(matrix: jax.Array) -> jax.Array:
         return matrix / jnp.sum(matrix, axis=1, keepdims=True)
 
     return jax.lax.fori_loop(0, squarings.astype(int), lambda _, matrix: normal(matrix @ matrix), normal(total))
@@ -324,7 +325,7 @@ def _simulated(loop: _Loop, law: jax.Array, key: Key, dt: Any, steps: int) -> Hi
     beta = loop.discount
     length = jnp.where(beta * dt > 0, -jnp.expm1(-beta * dt) / jnp.where(beta > 0, beta, 1), dt)
 
-    def step(carry, inputs):
+    def step(carry: tuple[Scalar, jax.Array], inputs: tuple[Scalar, Key]) -> tuple[tuple, tuple[jax.Array, ...]]:
         hidden, belief = carry
         number, key = inputs
         u = jnp.asarray(loop.control(belief), belief.dtype)  # a function of the belief only: the state is hidden

@@ -105,14 +105,14 @@ class MaxPlusMarch:
         least = jnp.sqrt(jax.lax.stop_gradient(self.growth()))  # the root has no derivative at zero
         means = jnp.asarray(tableau.means, p.dtype)
 
-        def step(carry):
+        def step(carry: tuple[Field, Scalar, Scalar]) -> tuple[Field, Scalar, Scalar]:
             p, left, count = carry
             first, speed = self.rate(p)
             whole = jnp.ceil(left * jnp.maximum(speed / FRACTION, least))
             dt = left / jnp.maximum(whole, 1)  # the steps are equal if the velocities do not change
             moved = p + dt * first  # the first mean is zero in every tableau
 
-            def stage(k, w):
+            def stage(k: Scalar, w: Field) -> Field:
                 return means[k] * p + (1 - means[k]) * (w + dt * self.rate(w)[0])
 
             # a loop compiles the slopes once instead of once per stage
@@ -192,10 +192,10 @@ def refined_maximum(values: Field, grid: Grid) -> tuple[Scalar, jax.Array]:
     best = jnp.unravel_index(jnp.argmax(values), grid.shape)
     top, around = values[best], _neighbours(grid, best, dtype)
 
-    def at(steps):
+    def at(steps: Sequence[int]) -> Scalar:
         return values[tuple(around[axis][0][step + 1] for axis, step in enumerate(steps))]
 
-    def unit(*moves):
+    def unit(*moves: tuple[int, int]) -> Scalar:
         steps = [0] * n
         for axis, step in moves:
             steps[axis] = step

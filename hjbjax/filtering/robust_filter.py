@@ -320,7 +320,7 @@ def _scan(
     grid = observer.grid
     dtype = jnp.result_type(float)
 
-    def step(p, seen):
+    def step(p: Field, seen: tuple[jax.Array, jax.Array]) -> tuple[Field, tuple[jax.Array, ...]]:
         p, steps = observer._after(p, seen[0].astype(dtype), seen[1].astype(dtype), dt, most)
         value, place = refined_maximum(p, cast(grid, dtype))
         return p, (p, place, value, steps)

@@ -26,6 +26,7 @@ from hjbjax.tracing import checks
 S = TypeVar("S")
 T = TypeVar("T")
 Field: TypeAlias = Callable[[State], State]
+Ladder: TypeAlias = Callable[[State], tuple[jax.Array, ...]]  # a function and its derivatives along vector fields
 
 
 @front_door
@@ -42,7 +43,7 @@ def lie_derivative(f: Field, h: Callable) -> Callable:
       -4.0
     """
 
-    def derivative(x):
+    def derivative(x: State | Sequence[float]) -> jax.Array:
         # forward mode: one pass through h, without forming its Jacobian
         with own_settings():
             return jax.jvp(in_state_dtype(h), (as_state(x),), (velocity(f)(as_state(x)),))[1]
@@ -64,7 +65,7 @@ def lie_bracket(f: Field, g: Field) -> Field:
       [0.0, -1.0, 0.0]
     """
 
-    def bracket(x):
+    def bracket(x: State | Sequence[float]) -> jax.Array:
         # two directional derivatives instead of two n × n Jacobians
         with own_settings():
             change = jax.jvp(velocity(g), (as_state(x),), (velocity(f)(as_state(x)),))[1]
@@ -124,7 +125,7 @@ class _Affine:
     inputs: int
     j: int | None
 
-    def __call__(self, x):
+    def __call__(self, x: State | Sequence[float]) -> State:
         with own_settings():
             x = as_state(x)
             zero = jnp.zeros(self.inputs, x.dtype)
@@ -146,7 +147,7 @@ def along(function: Callable[[State], T], x: State, directions: Array) -> tuple[
 def velocity(field: Field) -> Field:
     """The field in the dtype of the state; raises ValueError if it does not return the shape of the state."""
 
-    def call(x):
+    def call(x: State) -> jax.Array:
         rates = in_state_dtype(field)(x)
         # a number or shape (n, 1) would broadcast to brackets of the right shape with wrong entries
         if rates.shape != x.shape:
@@ -249,21 +250,20 @@ def stack_outputs(h: Callable[[State], Array | Number]) -> Callable[[State], jax
     return lambda x: jnp.atleast_1d(in_state_dtype(h)(x))
 
 
-def output_derivatives(
-    drifts: Sequence[Callable[[State], jax.Array]], h: Callable[[State], jax.Array]
-) -> Callable[[State], tuple[jax.Array, ...]]:
+def output_derivatives(drifts: Sequence[Callable[[State], jax.Array]], h: Callable[[State], jax.Array]) -> Ladder:
     """x ↦ (h, L_f h, L_f L_f h, …), each of shape (outputs,), with one derivative per drift f of shape (1, n)."""
 
-    def ladder(x):
+    def outputs(x: State) -> tuple[jax.Array, ...]:
         return (h(x),)
 
-    def longer(shorter, f):
-        def step(x):
+    def longer(shorter: Ladder, f: Callable[[State], jax.Array]) -> Ladder:
+        def step(x: State) -> tuple[jax.Array, ...]:
             found, changes = along(shorter, x, f(x))
             return (*found, changes[-1][0])  # [0] selects the only direction, f
 
         return step
 
+    ladder: Ladder = outputs
     for f in drifts:
         ladder = longer(ladder, f)
     return ladder
@@ -300,7 +300,7 @@ def as_state(x: State | Sequence[float]) -> jax.Array:
 def in_state_dtype(function: Callable[[State], Array | Number]) -> Callable[[State], jax.Array]:
     """The function with its result as an array in the dtype of the state."""
 
-    def call(x):
+    def call(x: State) -> jax.Array:
         try:
             return jnp.asarray(function(x), x.dtype)
         except jax.errors.JAXTypeError as error:

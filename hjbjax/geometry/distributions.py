@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.geometry.brackets import Field, along, as_fields, as_pytree, decide, stack_fields, stack_outputs
-from hjbjax.geometry.scaling import balance, with_terms, without_rounding
+from hjbjax.geometry.brackets import Field, Ladder, along, as_fields, as_pytree, decide, stack_fields, stack_outputs
+from hjbjax.geometry.scaling import Copies, balance, with_terms, without_rounding
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
@@ -170,12 +170,13 @@ def observability_codistribution(
 def _reach(fields: tuple[Field, ...], x: State, tolerance: Number, *, depth: int) -> Generations:
     """The fields and ``depth`` generations of brackets, and their terms."""
 
-    def build(copies, y):
+    def build(copies: Copies, y: State) -> tuple[jax.Array, ...]:
         (first, *others) = copies[0]
 
-        def generations(state):
+        def fields_themselves(state: State) -> tuple[jax.Array, ...]:
             return (first(state),)
 
+        generations: Ladder = fields_themselves
         for field in others:
             generations = _with_brackets(field, generations)
         return generations(y)
@@ -183,12 +184,10 @@ def _reach(fields: tuple[Field, ...], x: State, tolerance: Number, *, depth: int
     return with_terms(build, [stack_fields(fields)], x, depth + 1)
 
 
-def _with_brackets(
-    fields: Callable[[State], jax.Array], generations: Callable[[State], tuple[jax.Array, ...]]
-) -> Callable[[State], tuple[jax.Array, ...]]:
+def _with_brackets(fields: Callable[[State], jax.Array], generations: Ladder) -> Ladder:
     """Append one generation: the brackets of every field with every member of the last generation."""
 
-    def longer(x):
+    def longer(x: State) -> tuple[jax.Array, ...]:
         found, changes = along(generations, x, fields(x))  # (∂Y/∂x) X is changes[-1], shape (fields, members, n)
         _, bends = along(fields, x, found[-1])  # (∂X/∂x) Y, shape (members, fields, n)
         brackets = changes[-1] - bends.swapaxes(0, 1)  # [X, Y] by (4.4), every field X with every member Y
@@ -202,12 +201,13 @@ def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance:
     fields, h = functions
     depth = depth if fields else 0
 
-    def build(copies, y):
+    def build(copies: Copies, y: State) -> tuple[jax.Array, ...]:
         outputs, *others = copies
 
-        def generations(state):
+        def outputs_themselves(state: State) -> tuple[jax.Array, ...]:
             return (outputs[0](state),)
 
+        generations: Ladder = outputs_themselves
         for field in others[0][:depth] if others else ():
             generations = _with_derivatives(field, generations)
         # one Jacobian of all generations, because separate Jacobians would evaluate the shorter ones again
@@ -217,12 +217,10 @@ def _observe(functions: tuple[tuple[Field, ...], Callable], x: State, tolerance:
     return with_terms(build, stacked, x, max(depth, 1))
 
 
-def _with_derivatives(
-    fields: Callable[[State], jax.Array], generations: Callable[[State], tuple[jax.Array, ...]]
-) -> Callable[[State], tuple[jax.Array, ...]]:
+def _with_derivatives(fields: Callable[[State], jax.Array], generations: Ladder) -> Ladder:
     """Append one generation: the derivatives of the last generation along every field."""
 
-    def longer(x):
+    def longer(x: State) -> tuple[jax.Array, ...]:
         found, changes = along(generations, x, fields(x))
         return (*found, changes[-1].reshape(-1))  # from (fields, members)
 

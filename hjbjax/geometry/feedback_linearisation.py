@@ -13,7 +13,7 @@ is wrong only for a set of sample points of measure zero. A number counts as zer
 default) relative to its terms (see ``scaling``). Compare the margin and the residue of a verdict with the tolerance.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ from hjbjax.geometry.brackets import (
     stack_fields,
     stack_outputs,
 )
-from hjbjax.geometry.scaling import balance, with_terms
+from hjbjax.geometry.scaling import Copies, balance, with_terms
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
@@ -103,7 +103,7 @@ class Linearisation:
     output: Callable[[State], Array | Number]
     degrees: tuple[int, ...] | None
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Callable]:
         return iter((self.alpha, self.beta, self.coordinates))
 
     def alpha(self, x: State) -> Control:
@@ -319,7 +319,7 @@ def _first_effects(
     (f, *gs), h, radius = functions
     stacked = [stack_fields([f]), stack_fields(gs), stack_outputs(h)]
 
-    def build(copies, y):
+    def build(copies: Copies, y: State) -> jax.Array:
         drifts, inputs, outputs = copies
         slopes = jnp.stack(jax.jacfwd(output_derivatives(drifts[1:], outputs[0]))(y))  # (depth, outputs, n)
         return slopes @ inputs[0](y).T

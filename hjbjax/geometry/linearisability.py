@@ -18,6 +18,7 @@ import numpy as np
 
 from hjbjax.geometry.brackets import (
     Field,
+    Ladder,
     along,
     as_bool,
     as_fields,
@@ -136,7 +137,7 @@ def _ladders_near(
     fields, radius = functions
     stacked = [stack_fields(fields[:1]), stack_fields(fields[1:])]
 
-    def at(y):
+    def at(y: State) -> Ladders:
         return with_terms(lambda copies, z: _ad_ladder(copies[0], copies[1], z), stacked, y, depth)
 
     return jax.vmap(at)(near(x, radius, samples))
@@ -147,7 +148,7 @@ def _linearisability(ladders: Ladders, x: State, tolerance: Number) -> Linearisa
     n, depth = x.shape[0], ladders[0][0].shape[1]
     up_to = jnp.asarray(np.tril(np.ones((depth, depth), bool)))  # row k: the generations contained in G_k
 
-    def at(found, terms):
+    def at(found: tuple[Array, Array], terms: tuple[Array, Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         # members (depth, m, n), slopes (depth − 1, m, n, n)
         (members, slopes), (_, sizes) = _in_common_units(found, terms)
         # all G_k in one program, with zeros for later generations, so that only one SVD is compiled
@@ -201,22 +202,23 @@ def _ad_ladder(
         here = gs(x)
         return here[None], jnp.zeros((0, *here.shape, x.shape[0]), x.dtype)
 
-    def ladder(y):
+    def inputs_themselves(y: State) -> tuple[jax.Array, ...]:
         return (gs(y),)
 
-    def longer(shorter, f):
-        def step(y):
+    def longer(shorter: Ladder, f: Callable[[State], jax.Array]) -> Ladder:
+        def step(y: State) -> tuple[jax.Array, ...]:
             found, changes = along(shorter, y, f(y))  # changes[-1] is (∂w/∂y) f, shape (1, m, n)
             _, bends = along(f, y, found[-1])  # (∂f/∂y) w, shape (m, 1, n)
             return (*found, changes[-1][0] - bends[:, 0])
 
         return step
 
+    ladder: Ladder = inputs_themselves
     for f in drifts[2:]:
         ladder = longer(ladder, f)
     # the slopes of the last member give the next member without another derivative
-    found, slopes = along(ladder, x, jnp.eye(x.shape[0], dtype=x.dtype))
-    slopes = jnp.moveaxis(jnp.stack(slopes), 1, -1)  # (count − 1, m, n, n)
+    found, changes = along(ladder, x, jnp.eye(x.shape[0], dtype=x.dtype))
+    slopes = jnp.moveaxis(jnp.stack(changes), 1, -1)  # (count − 1, m, n, n)
     last = drifts[1]
     _, bends = along(last, x, found[-1])
     # (∂w/∂x) f − (∂f/∂x) w for the last w

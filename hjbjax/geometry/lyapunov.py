@@ -27,6 +27,7 @@ from hjbjax.tracing import checks
 from hjbjax.tracing.closures import settled_function
 
 Functions: TypeAlias = tuple[Callable, Callable]  # V and f, functions of (x) or (t, x)
+Climb: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]  # the point, the measure there, and the length of a step
 Place: TypeAlias = tuple[Box | Ball, Array, Array | None]  # the region, the equilibrium, and the interval of times
 
 CLIMBS = 32  # number of starts of the local search for each of the three measures
@@ -219,21 +220,21 @@ def _search(functions: Functions, place: Place, starts: Array, tolerance: float)
     region, rest, times = place
     half = half_widths(region)
 
-    def at(z):
+    def at(z: Array) -> tuple[jax.Array | None, jax.Array]:
         return state_of(region, times, z)
 
-    def value(z):
+    def value(z: Array) -> jax.Array:
         return _value(functions[0], times, z, at(z)[1])
 
-    def rates(z):
+    def rates(z: Array) -> tuple[jax.Array, jax.Array]:
         return _terms(functions, times, z, at(z)[1])
 
-    def relative(z):  # dV/dt relative to its terms
+    def relative(z: Array) -> jax.Array:  # dV/dt relative to its terms
         rate, terms = rates(z)
         # divide by 1 at the equilibrium, where 0/0 would make the value and the derivative NaN
         return rate / jnp.where(terms > 0, terms, 1)
 
-    def low(z):
+    def low(z: Array) -> jax.Array:
         x = at(z)[1]
         square = jnp.sum(((x - rest) / half) ** 2)
         above = value(z) - _value(functions[0], times, z, rest)
@@ -303,7 +304,7 @@ def _best(measure: Callable[[Array], jax.Array], starts: Array) -> jax.Array:
     # top_k ranks NaN highest, and no climb would ever improve on it
     _, order = jax.lax.top_k(jnp.where(jnp.isnan(values), -jnp.inf, values), min(CLIMBS, starts.shape[0]))
 
-    def climb(carry, _):
+    def climb(carry: Climb, _: None) -> tuple[Climb, None]:
         z, best, step = carry
         # steps of a fixed length, because the measures have no common scale for a gradient step
         slope = jax.grad(measure)(z)
@@ -313,7 +314,7 @@ def _best(measure: Callable[[Array], jax.Array], starts: Array) -> jax.Array:
         better = there > best
         return (jnp.where(better, moved, z), jnp.where(better, there, best), jnp.where(better, step, step / 2)), None
 
-    def run(z):
+    def run(z: jax.Array) -> tuple[jax.Array, jax.Array]:
         # the first step is a tenth of the cube; 80 halvings leave 1e-25 of it, so no stopping criterion is needed
         first = (z, measure(z), jnp.asarray(0.1, z.dtype))
         (z, best, _), _ = jax.lax.scan(climb, first, length=STEPS)

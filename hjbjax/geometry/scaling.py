@@ -18,11 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.types import Array, State
+from hjbjax.problem.types import Array, Scalar, State
 
 Function: TypeAlias = Callable[[State], jax.Array]
 T = TypeVar("T")
-Build: TypeAlias = Callable[[Sequence[Sequence[Function]], State], T]  # a pytree of arrays
+Copies: TypeAlias = Sequence[Sequence[Function]]  # the perturbed copies of every function
+Build: TypeAlias = Callable[[Copies, State], T]  # a pytree of arrays
 
 DRAWS = 8  # random perturbations; the chance that all change a sum of two terms by less than 1 % of its size is 1e-16
 NEGLIGIBLE = 16  # times eps: entries of a vector differ by units, but not by a factor of 3e-15
@@ -46,7 +47,7 @@ def with_terms(build: Build[T], functions: Sequence[Function], x: State, uses: i
     # fixed seed, so that the verdict is the same in every call, traced or not
     random = np.random.default_rng(0)
 
-    def draws(shape):
+    def draws(shape: tuple[int, ...]) -> jax.Array:
         # the first draw is zero and evaluates the functions themselves
         spread = random.uniform(-1.0, 1.0, (DRAWS, *shape))
         return jnp.asarray(np.concatenate([np.zeros((1, *shape)), spread]), x.dtype) * part
@@ -54,7 +55,7 @@ def with_terms(build: Build[T], functions: Sequence[Function], x: State, uses: i
     places = draws(x.shape)
     changes = [[tuple(draws(size.shape) * size for size in pair) for _ in range(uses)] for pair in sizes]
 
-    def once(place, change):
+    def once(place: jax.Array, change: Sequence[Sequence[tuple[jax.Array, ...]]]) -> T:
         copies = [
             [_changed(function, x, *pair) for pair in pairs] for function, pairs in zip(functions, change, strict=True)
         ]
@@ -105,7 +106,7 @@ def balance(matrix: Array) -> tuple[jax.Array, jax.Array]:
     c = jnp.linalg.pinv(normal.astype(logs.dtype), rtol=1e-4, hermitian=True) @ right
     r = -jnp.sum(jnp.where(there, logs + c, 0), axis=1) / rows
 
-    def sweep(_, scales):
+    def sweep(_: Scalar, scales: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         r, c = scales
         size = jnp.where(there, jnp.exp(logs + r[:, None] + c), 0)
         c = c - _log_length(size, 0)

@@ -18,7 +18,7 @@ import numpy as np
 from hjbjax.geometry.brackets import Field, as_fields, decide, near, stack_fields
 from hjbjax.geometry.distributions import Distribution, span
 from hjbjax.geometry.lyapunov import LyapunovReport, lyapunov_check, lyapunov_derivative
-from hjbjax.geometry.scaling import balance, with_terms, without_rounding
+from hjbjax.geometry.scaling import Copies, balance, with_terms, without_rounding
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 
@@ -103,7 +103,7 @@ def _linearisation(
     if not drift:
         return with_terms(lambda copies, y: copies[0][0](y), [field], x, 1), None, jnp.asarray(True)
 
-    def build(copies, y):
+    def build(copies: Copies, y: State) -> tuple[jax.Array, jax.Array]:
         return copies[0][0](y), jax.jacfwd(copies[0][0])(y)
 
     (values, slopes), (sizes, bends) = with_terms(build, [field], x, 1)

@@ -112,7 +112,7 @@ def _best_of_quadratics(
     start: Best = (value, [jnp.zeros_like(value) for _ in centre], [])
     table = list(itertools.product(*(range(len(each)) for each in branches)))
 
-    def step(best, choice):
+    def step(best: Best, choice: jax.Array) -> tuple[Best, None]:
         picked = [_picked(options, number) for options, number in zip(branches, choice, strict=True)]
         shrink, left = _room(radius, sum(jnp.where(follows, 0, kink**2) for follows, _, kink in picked))
         free = least_in_ball(
@@ -175,7 +175,7 @@ def _on_sphere(radius: PerNode, slope: Sequence[PerNode], curvature: Sequence[Pe
     tiny = jnp.finfo(jnp.result_type(*slope)).tiny
     known = jax.lax.stop_gradient((radius, list(slope), list(curvature)))
 
-    def newton(mu, radius, slope, curvature):
+    def newton(mu: jax.Array, radius: PerNode, slope: Sequence[PerNode], curvature: Sequence[PerNode]) -> jax.Array:
         parts = [jnp.where(k + mu > 0, k + mu, 1) for k in curvature]
         u = [b / part for b, part in zip(slope, parts, strict=True)]
         norm = jnp.sqrt(jnp.maximum(_dot(u, u), tiny))

@@ -104,7 +104,7 @@ def _nested(
 ) -> tuple[jax.Array, Action, Action]:
     """The optimum of the outer player, who moves first and anticipates the inner player's reply."""
 
-    def objective(action):
+    def objective(action: Action) -> tuple[jax.Array, Action]:
         return best_response(hamiltonian, inner, lambda reply: join(action, reply), most=INNER)
 
     if outer.admissible is None:  # for example a lower game without controls: no player moves first
@@ -151,7 +151,7 @@ def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
     if isinstance(admissible, Box):
         return lambda action: [jnp.clip(u, admissible.lo[j], admissible.hi[j]) for j, u in enumerate(action)]
 
-    def onto_ball(action):
+    def onto_ball(action: Action) -> Action:
         shrink = jnp.minimum(1, admissible.radius * inverse_root(sum(u * u for u in action)))
         return [shrink * u for u in action]
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.hamiltonian.ball import least_in_ball
-from hjbjax.hamiltonian.search import enumerate_actions, refine
+from hjbjax.hamiltonian.search import Action, enumerate_actions, refine
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, samples, spacing
 from hjbjax.problem.types import Control, Costate, DType, Number, Scalar, State
@@ -170,14 +170,14 @@ def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], ja
     assert isinstance(admissible, (Box, Ball))
     count = admissible.dim
 
-    def project(action):
+    def project(action: Action) -> Action:
         u = jnp.stack(action)
         if isinstance(admissible, Ball):
             # 1e-300 keeps the quotient finite at the centre, which does not move
             return list(u * jnp.minimum(1, admissible.radius / jnp.maximum(jnp.linalg.norm(u), 1e-300)))
         return list(jnp.clip(u, admissible.lo, admissible.hi))
 
-    def objective(action):
+    def objective(action: Action) -> tuple[jax.Array, list]:
         return energy(jnp.stack([jnp.asarray(entry, dtype) for entry in action])), []
 
     best = enumerate_actions(objective, jnp.asarray(samples(admissible, BUDGET), dtype), 1)

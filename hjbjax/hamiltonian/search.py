@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.stencil import PerNode
+from hjbjax.problem.types import Scalar
 
 T = TypeVar("T")
 Action = list
@@ -65,7 +66,7 @@ def enumerate_actions(
     # the worst possible value, so that the first evaluation wins
     best = everywhere(sign * jnp.inf), [everywhere(points[0, j]) for j in range(inputs)], [everywhere(0) for _ in extra]
 
-    def step(best, block):
+    def step(best: Best, block: jax.Array) -> tuple[Best, None]:
         return best_of(objective, [[block[k, j] for j in range(inputs)] for k in range(chunk)], sign, best), None
 
     return jax.lax.scan(step, best, rows.reshape(padded // chunk, chunk, inputs))[0]
@@ -134,11 +135,11 @@ def refine(
 
     table = jnp.asarray(_moves(len(action)), dtype)
 
-    def one_move(move, best):
+    def one_move(move: jax.Array, best: Best) -> Best:
         moved = [entry + part * width for entry, part, width in zip(best[1], move, spacing, strict=True)]
         return best_of(objective, [project(moved)], sign, best)
 
-    def one_round(k, best):
+    def one_round(k: Scalar, best: Best) -> Best:
         for place in range(table.shape[1]):
             best = one_move(table[k, place], best)
         return best

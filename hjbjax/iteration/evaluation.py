@@ -30,6 +30,7 @@ The object enters compiled programs as a pytree, here without numbers, and ``sol
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +42,7 @@ from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import Field, Number, Scalar
+from hjbjax.problem.types import Array, Field, Number, Scalar, Verdict
 
 OPEN_FRACTION = 1e-8  # fraction of the residual to which a Krylov method reduces it with open ends
 
@@ -97,7 +98,7 @@ class Sweeps(Evaluation):
     count: int = 3
     rough, in_parts = True, True
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         arguments.count(self.count, "Sweeps: count")
 
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
@@ -124,17 +125,17 @@ class Krylov(Evaluation):
     max_steps: int = 200
     open_ends, in_parts = True, True
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         arguments.positive(self.fraction, "Krylov: fraction", most=1)
         arguments.count(self.max_steps, "Krylov: max_steps")
 
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """BiCGStab on (I − W) δ = s with one Gauss–Seidel round as preconditioner."""
 
-        def matvec(delta):  # (I − W) δ: the residual of a zero right-hand side, negative
+        def matvec(delta: Field) -> Field:  # (I − W) δ: the residual of a zero right-hand side, negative
             return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
-        def precondition(residual):
+        def precondition(residual: Field) -> Field:
             return relaxed(PolicyEquation(residual, equation.weights), grid, 1)
 
         fraction = self.fraction
@@ -221,6 +222,10 @@ def left_over(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
     return sum(terms, start=equation.source - delta)
 
 
+# x, its residual, (alpha, omega, rho), the direction, its product with A, and the number of steps
+Recurrence: TypeAlias = tuple[Field, Field, tuple[Scalar, Scalar, Scalar], Field, Field, Scalar]
+
+
 def bicgstab(
     matvec: Callable[[Field], Field],
     precondition: Callable[[Field], Field],
@@ -248,11 +253,11 @@ def bicgstab(
 
     least = jnp.square(jnp.asarray(fraction, source.dtype)) * dot(source, source)
 
-    def unfinished(carry):
+    def unfinished(carry: Recurrence) -> Verdict:
         _, residual, _, _, _, count = carry
         return (dot(residual, residual) > least) & (count < most) & (count >= 0)
 
-    def step(carry):
+    def step(carry: Recurrence) -> Recurrence:
         x, residual, (alpha, omega, rho), direction, moved, count = carry
         new = dot(source, residual)
         direction = residual + new / rho * alpha / omega * (direction - omega * moved)
@@ -278,7 +283,8 @@ def bicgstab(
 def jacobi(equation: PolicyEquation, grid: Grid, sweeps: int) -> Field:
     """Damped Jacobi sweeps with ½(I + T), since the star stencil has an eigenvalue near −1."""
 
-    def sweep(_, delta):  # half a step: I − W has eigenvalues up to 2, for which a whole step would oscillate
+    # half a step: I − W has eigenvalues up to 2, for which a whole step would oscillate
+    def sweep(_: Scalar, delta: Field) -> Field:
         return delta + 0.5 * left_over(equation, grid, delta)
 
     return jax.lax.fori_loop(0, sweeps, sweep, jnp.zeros_like(equation.source))
@@ -324,10 +330,10 @@ def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) ->
     offsets, weights = stencil.inward(equation.weights.offsets, equation.weights.values, grid)
     word = np.uint32
 
-    def numbers(words):
+    def numbers(words: Array) -> np.ndarray:
         return np.ascontiguousarray(words).view(dtype).reshape(grid.shape).astype(np.float64)
 
-    def on_host(source, *weights):
+    def on_host(source: Array, *weights: Array) -> np.ndarray:
         delta = factor_and_solve(offsets, [numbers(w) for w in weights], numbers(source), grid, transposed)
         return np.ascontiguousarray(delta.astype(dtype)).view(word).reshape(source.shape)
 

@@ -205,7 +205,7 @@ def run(task: Task, state: State, until: Number) -> State:
     """Step until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
     start = state.step  # the first index of this chunk's history
 
-    def step(state):
+    def step(state: State) -> State:
         # made loop-variant, otherwise XLA compiles a kernel for every scalar of every action that it can hoist
         controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
         on = dataclasses.replace(task.on, problem=altered(task.problem, controls=controls), grid=grid)

@@ -43,7 +43,7 @@ from hjbjax.iteration.evaluation import Evaluation, check_choice, check_evaluati
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import Field, Number, Scalar
+from hjbjax.problem.types import Field, Number, Scalar, Verdict
 
 CLIMB = 100_000  # steps of value iteration without progress: without discount V rises by L Δt per step for a long time
 # Goal of the inner residual relative to the outer one. While the outer residual falls, an accurate response to a policy
@@ -147,7 +147,7 @@ class ValueIteration(Method):
     policy: bool = True
     relaxes, in_parts, by_defect = True, True, True
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not isinstance(self.policy, bool):
             raise TypeError(f"ValueIteration: policy is {self.policy!r}; wanted True or False")
 
@@ -182,7 +182,7 @@ class PolicyIteration(Method):
         """True if the evaluation supports divided nodes; an open choice is made among those that do."""
         return self.evaluation is not None and self.evaluation.in_parts
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.evaluation is not None:
             check_evaluation(self.evaluation, "PolicyIteration: evaluation")
         arguments.count(self.replies, "PolicyIteration: replies")
@@ -218,7 +218,7 @@ class Nested(Method):
     inner: Method = PolicyIteration()
     coarsest: int = 2000
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_method(self.inner, "Nested: inner")
         if self.inner.coarsest is not None:  # every level would start again at the coarsest grid
             wanted = "hjb.PolicyIteration(...) or hjb.ValueIteration(), which run on one grid"
@@ -322,7 +322,7 @@ def evaluated(
       replies: the largest number of responses of the inner player.
     """
 
-    def reply(carry):
+    def reply(carry: tuple[Field, Greedy, Scalar, Scalar]) -> tuple[Field, Greedy, Scalar, Scalar]:
         value, policy, _, count = carry
         delta = evaluate(evaluation, question.equation(value, policy), question.grid)
         value = question.impose(value + delta)
@@ -330,7 +330,7 @@ def evaluated(
         # the response at the new value leaves a residual of the inner problem only, since the outer policy is fixed
         return value, policy, question.residual(question.equation(value, policy)), count + 1
 
-    def unfinished(carry):
+    def unfinished(carry: tuple[Field, Greedy, Scalar, Scalar]) -> Verdict:
         return (carry[2] > goal) & (carry[3] < replies)
 
     # infinite, so that the outer player's policy is evaluated at least once, against the response it was found with

@@ -28,7 +28,7 @@ additive certificate of that problem is small enough, or the residual is roundin
 import abc
 import dataclasses
 import math
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
-from hjbjax.problem.types import DType, Field, Number, Numbers, Scalar
+from hjbjax.problem.types import DType, Field, Number, Numbers, Scalar, Verdict
 
 ROUNDING = 16  # in units in the last place of max|V|: smaller residuals are rounding
 TOL = 1e-6  # cost units, for a value whose range is one or more
@@ -124,7 +124,7 @@ class Tableau:
     means: tuple[float, ...]
     euler: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "means", tuple(map(float, self.means)))
         if not self.means or not all(0 <= share < 1 for share in self.means):
             raise ValueError(f"Tableau: got means = {self.means!r}, wanted one number per stage, from 0 to below 1")
@@ -220,7 +220,7 @@ class Explicit(TimeMethod):
     fraction: Number = 0.9
     limited, in_parts = True, True
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # True equals 1 in Python, and would select Euler's method
         named = not isinstance(self.stages, bool) and self.stages in (None, *TABLEAUX)
         if not named and not isinstance(self.stages, Tableau):
@@ -253,7 +253,7 @@ class Explicit(TimeMethod):
             jnp.asarray(table, dtype) for table in (tableau.means, tableau.times[:-1], tableau.times[1:])
         )
 
-        def stage(k, carry):
+        def stage(k: Scalar, carry: tuple[Field, Any]) -> tuple[Field, Any]:
             w, seen = carry
             begun, factor = _elapsed(march.on.problem, starts[k], length, dt)
             rate, now = march.rate(w, t - begun)
@@ -287,7 +287,7 @@ class Implicit(TimeMethod):
     max_steps: int = 100
     monotone_only, in_parts = True, True
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.evaluation is not None:
             check_evaluation(self.evaluation, "Implicit: evaluation")
         if self.tol is not None:
@@ -350,6 +350,10 @@ class Tolerance:
         return jnp.asarray(self.size * jnp.minimum(1, grid.largest(value) - grid.least(value)), value.dtype)
 
 
+# the value, its policy, the residual, True if it is small enough, the least residual before, and the number of steps
+Improvement: TypeAlias = tuple[Field, Greedy, Scalar, Verdict, Scalar, Scalar]
+
+
 @pytree_dataclass()
 class ImplicitStep:
     """The stationary problem of one implicit step.
@@ -405,7 +409,7 @@ class ImplicitStep:
           max_steps: the largest number of policy improvements.
         """
 
-        def look(value, incumbent):
+        def look(value: Field, incumbent: Greedy) -> tuple[Greedy, Scalar, Verdict]:
             # the incumbent stays a candidate, since a search between samples may miss it and alternate between two
             # actions
             policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed, incumbent=incumbent))
@@ -419,17 +423,17 @@ class ImplicitStep:
             enough = (bound.error <= tol.at(value, self.grid)) | (bound.residual <= rounding)
             return policy, bound.residual, enough
 
-        def unfinished(carry):
+        def unfinished(carry: Improvement) -> Verdict:
             _, _, residual, done, _, count = carry
             # the march reports NaN
             return ~done & (count <= max_steps) & ((count == 0) | jnp.isfinite(residual))
 
-        def improve(carry):
+        def improve(carry: Improvement) -> Improvement:
             value, policy, residual, _, least, count = carry
             before = residual
             policy, residual, done = look(value, policy)
 
-            def evaluated():
+            def evaluated() -> Field:
                 goal = methods.inner_goal(residual, jnp.minimum(least, before))
                 return self._evaluated(value, policy, goal, evaluation)
 

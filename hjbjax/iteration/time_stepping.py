@@ -25,7 +25,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.problem.types import Field, Mask, Nodes, Number, Numbers, Scalar
+from hjbjax.problem.types import Field, Mask, Nodes, Number, Numbers, Scalar, Verdict
 from hjbjax.solution.status import Status
 
 TRIES = 30  # largest number of attempts to shorten a step; the rates of its first stage do not depend on its length
@@ -216,11 +216,11 @@ def begin(march: March, value: Field, left: Number) -> Front:
 def run(march: March, front: Front, until: Number, most: Number) -> Front:
     """Take at most ``most`` steps towards the time ``until``, as long as the values are finite."""
 
-    def goes_on(carry):
+    def goes_on(carry: tuple[Front, Scalar]) -> Verdict:
         front, left = carry
         return (front.code == Status.RUNNING) & (front.left[0] > 0) & (left > 0)
 
-    def step(carry):
+    def step(carry: tuple[Front, Scalar]) -> tuple[Front, Scalar]:
         front, left = carry
         if march.bare:  # made loop-variant, otherwise XLA stores arrays that depend only on the grid
             grid, front = jax.lax.optimization_barrier((march.grid, front))
@@ -297,13 +297,13 @@ def _short_enough(
     """V after one of ``count`` or more equal steps, its clock, true if every stage was stable, and the rates."""
     left = front.left[0]
 
-    def too_long(carry):
+    def too_long(carry: tuple[Scalar, Scalar | int, Field, Seen]) -> Verdict:
         count, tries, _, seen = carry
         # initially Q = ∞, so this is true; 1e-6 is rounding of the product, not instability
         most = _allowed(march, seen, 1 / march.method.tableau.euler)
         return (left / count > most * (1 + 1e-6)) & (tries < TRIES)
 
-    def attempt(carry):
+    def attempt(carry: tuple[Scalar, Scalar, Field, Seen]) -> tuple[Scalar, Scalar, Field, Seen]:
         count, tries, _, seen = carry
         # from the rates just evaluated, with at least one more step, so that every attempt is shorter
         more = jnp.maximum(jnp.ceil(left / _allowed(march, seen, march.method.courant) - 1e-4), count + 1)
@@ -373,7 +373,7 @@ def greedy(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tu
     on = march.on.at(t)
     _, u, d = optimum.optimise(discrete.around(on, value))
 
-    def full(action):
+    def full(action: Action) -> tuple[Field, ...]:
         return tuple(jnp.broadcast_to(jnp.asarray(entry, value.dtype), march.grid.shape) for entry in action)
 
     return full(u), full(d)

@@ -8,7 +8,7 @@ their end, so two or three rounds of sweeps usually find every path, however lon
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import jax
@@ -19,6 +19,7 @@ from hjbjax.discretisation import cut_cells, edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian.players import players_of
+from hjbjax.hamiltonian.search import Action
 from hjbjax.markov_chain import tried_actions
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
@@ -79,7 +80,7 @@ def _more_open_jumps(
     grid, points = on.grid, jnp.asarray(points, on.dtype)
     mine = players_of(on).control
 
-    def tried(actions, opened):
+    def tried(actions: Iterable[Action], opened: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         for each in actions:
             rates = jump_rates(on, each)
             # an action that a constrained end forbids makes no jump at all, not even to the node itself
@@ -89,7 +90,7 @@ def _more_open_jumps(
             opened = tuple(p | ((c > least) & stays) for p, c in zip(opened, rates.values, strict=True))
         return opened
 
-    def also(k, opened):
+    def also(k: Scalar, opened: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         action = list(points[k])
         return tried(tried_actions.with_kinks(on, mine, action) if kinks else [action], opened)
 
@@ -196,8 +197,8 @@ def _controllable_predecessors(
     # the player who moves first is in the outer loop: upper game: some u for all d, lower game: for all d some u
     outer, inner = (us, ds) if upper else (ds, us)
 
-    def answered(first):
-        def also(ok, second):
+    def answered(first: jax.Array) -> jax.Array:
+        def also(ok: jax.Array, second: jax.Array) -> tuple[jax.Array, None]:
             u, d = (first, second) if upper else (second, first)
             rates = jump_rates(on, list(u), list(d))
             jumps = zip(rates.offsets, rates.values, strict=True)
@@ -211,7 +212,7 @@ def _controllable_predecessors(
 
         return jax.lax.scan(also, jnp.full(grid.shape, upper), inner)[0]
 
-    def over(ok, first):
+    def over(ok: jax.Array, first: jax.Array) -> tuple[jax.Array, None]:
         return (ok | answered(first) if upper else ok & answered(first)), None
 
     new = found | (inside & jax.lax.scan(over, jnp.full(grid.shape, not upper), outer)[0])
@@ -264,17 +265,17 @@ def _refuge(
     mine, pairs = players_of(on).control, jnp.asarray(pairs, on.dtype)
     m = len(mine.driven)
 
-    def shrink(carry):
+    def shrink(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         inside, _ = carry
 
         # expensive actions are excluded if the refuge has to be free of cost
-        def kept(action, answer):
+        def kept(action: Action, answer: Action) -> jax.Array:
             allowed = ~edges.inadmissible(on, action, answer)
             if dearest is not None:
                 allowed &= on.running_cost(action, answer) <= dearest
             return allowed & _stays(jump_rates(on, action, answer), on.grid, inside, 0.0)
 
-        def also(k, found):
+        def also(k: Scalar, found: jax.Array) -> jax.Array:
             for action in tried_actions.with_kinks(on, mine, list(pairs[k, :m])):
                 found |= kept(action, list(pairs[k, m:]))
             return found

@@ -7,6 +7,7 @@ fault. If there is one, a second pass computes counts and first nodes for the er
 import dataclasses
 import functools
 import itertools
+from collections.abc import Iterable
 from typing import Any, NamedTuple, NoReturn
 
 import jax
@@ -118,7 +119,7 @@ def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int |
     amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
     x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)
 
-    def look(k, amiss):
+    def look(k: Scalar, amiss: Verdict) -> Verdict:
         here, (u, d) = jax.lax.optimization_barrier((x, jax.tree.map(lambda rows: rows[k], tried)))  # see _survey
         bad = _faults(on, here, list(u), list(d)).values()
         # as integers: for booleans XLA would make two passes
@@ -163,7 +164,9 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
             relevant = inside if name == "exit_cost" else True
             found[name] = _count(relevant & ~jnp.isfinite(on.at_nodes(ingredient)), grid)
 
-    def body(carry, index_and_action):
+    def body(
+        carry: dict[str, _Finding], index_and_action: tuple[Scalar, jax.Array, jax.Array]
+    ) -> tuple[dict[str, _Finding], None]:
         index, u, d = index_and_action
         here, u, d = jax.lax.optimization_barrier((x, u, d))  # otherwise XLA keeps an array of all nodes per invariant
         new = {name: _count(bad, grid, index) for name, bad in _faults(on, here, list(u), list(d)).items()}
@@ -181,11 +184,11 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
     return found | carry
 
 
-def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, Mask]:
+def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, jax.Array]:
     """The nodes where drift, cost or noise is faulty under one action, by the name of the fault."""
     problem = on.problem
 
-    def faulty(entries):
+    def faulty(entries: Iterable[Numbers]) -> jax.Array:
         return functools.reduce(jnp.logical_or, (~jnp.isfinite(jnp.asarray(entry, on.dtype)) for entry in entries))
 
     # a problem without cost or noise does not compile their checks

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from hjbjax.solution.solution import Solution
+
+T = TypeVar("T")
 
 OPACITY = 0.55  # of a surface, so that objects behind it are visible
 
@@ -221,7 +223,7 @@ def _projection(field: Field, project: int | str | Sequence[int | str]) -> Field
     if len(stay) < 2:
         raise ValueError("zero_level_set: project leaves fewer than two axes")
 
-    def pick(entries):
+    def pick(entries: Sequence[T]) -> tuple[T, ...]:
         return tuple(entries[axis] for axis in stay)
 
     smaller = Grid(

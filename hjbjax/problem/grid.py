@@ -71,7 +71,7 @@ class Grid:
     parts: Parts | None = dataclasses.field(init=False, repr=False, default=None)  # over which devices; None: one
     faces: tuple[Any, ...] = dataclasses.field(init=False, repr=False, default=())  # prescribed ends with their numbers
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         lo, hi = arguments.corner(self.lo, "lo"), arguments.corner(self.hi, "hi")
         shape = arguments.counts(self.shape)
         periodic = arguments.periodic_flags(self.periodic, len(shape))

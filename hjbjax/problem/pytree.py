@@ -83,11 +83,11 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
             _compare_by_value(cls, static)
 
         # with keys, so that JAX names a leaf in its messages as the user does: ``.discount``
-        def flatten_with_keys(self):
+        def flatten_with_keys(self: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
             children = [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in leaves]
             return children, tuple(getattr(self, name) for name in static)
 
-        def unflatten(aux, children):
+        def unflatten(aux: tuple[Any, ...], children: Iterable[Any]) -> Any:
             self = object.__new__(cls)  # skips __init__ and the lock of a frozen dataclass
             for name, value in (*zip(leaves, children, strict=True), *zip(static, aux, strict=True)):
                 object.__setattr__(self, name, value)
@@ -169,13 +169,13 @@ def refuse_misspelt(words: Iterable[str], by_name: Set[str], function: str) -> N
 def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:
     """Make objects without leaves equal if their fields are equal; as static arguments they then do not recompile."""
 
-    def key(self):
+    def key(self: Any) -> tuple[Any, ...]:
         return tuple(getattr(self, name) for name in names)
 
-    def equal(self, other):
+    def equal(self: Any, other: object) -> bool:
         return key(self) == key(other) if type(other) is cls else NotImplemented
 
-    def number(self):
+    def number(self: Any) -> int:
         return hash((cls, key(self)))
 
     cls.__eq__, cls.__hash__ = equal, number  # type: ignore[method-assign, assignment]
@@ -351,7 +351,7 @@ def as_jax(tree: T) -> T:
     a 64-bit trace with a 32-bit program.
     """
 
-    def convert(leaf):
+    def convert(leaf: Any) -> Any:
         if not isinstance(leaf, (np.ndarray, np.generic)):
             return leaf
         # with an explicit type; otherwise JAX may return its cached copy of the array in the other precision
@@ -363,7 +363,7 @@ def as_jax(tree: T) -> T:
 def cast(tree: T, dtype: DType) -> T:
     """The tree with its floating-point leaves in ``dtype``; integers and booleans are unchanged."""
 
-    def convert(leaf):
+    def convert(leaf: Any) -> Any:
         if not jax.numpy.issubdtype(jax.numpy.result_type(leaf), jax.numpy.floating):
             return leaf
         return jax.numpy.asarray(leaf, dtype)

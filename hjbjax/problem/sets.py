@@ -49,7 +49,7 @@ class Box:
     lo: Any
     hi: Any = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.hi is None:
             pair = np.shape(self.lo) == (2,)
             cure = f"Box({self.lo[0]!r}, {self.lo[1]!r})" if pair else "Box([-1.0], [1.0])"
@@ -99,7 +99,7 @@ class Ball:
     radius: Any
     dim: int
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         radius = _finite_numbers(self.radius, "Ball.radius")
         if not _is_count(self.dim):
             raise ValueError(f"Ball: got dim = {self.dim!r}, wanted a positive integer")
@@ -124,7 +124,7 @@ class Finite:
 
     points: Any
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         points = _finite_numbers(self.points, "Finite.points")
         if np.ndim(points) == 1 and np.size(points) > 0:  # ambiguous: three controls, or one control of three inputs
             raise ValueError(f"Finite: got points of shape {np.shape(points)}, wanted (K, m): one row per control")

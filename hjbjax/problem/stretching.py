@@ -37,7 +37,7 @@ class Sinh:
     strength: Number
     center: Number = 0.5
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if is_traced(self.strength, self.center):
             return
         if not (np.isfinite(self.strength) and self.strength > 0):

@@ -58,7 +58,7 @@ class Checkpoint:
     path: Path
     every: float = SECONDS
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         arguments.positive(self.every, "Checkpoint: every", "in seconds", endless=True)
 
 

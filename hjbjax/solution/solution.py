@@ -120,7 +120,7 @@ class Solution:
     message: str = ""
     problem: Problem | None = dataclasses.field(default=None, repr=False)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if isinstance(self.code, Status):
             object.__setattr__(self, "code", int(self.code))
 

@@ -293,7 +293,7 @@ def _trace_once(
     """Shape or fault of a function's result, an index outside its array, True if it calls Python, its operations."""
     verdicts = []  # recorded while tracing, because ``make_jaxpr`` would raise its own error on a result that is text
 
-    def probe(*arguments):
+    def probe(*arguments: jax.Array) -> Any:
         result = function(*arguments)
         verdicts.append(_verdict(result))
         return () if isinstance(verdicts[0], str) else result

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ from hjbjax.tracing.stacks import is_components, object_array
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
+
+Rows: TypeAlias = Sequence[Sequence[jax.Array]]  # the entries of each operand or result
 
 
 def components(function: Callable, *arguments: Any, dtype: DType) -> np.ndarray:
@@ -112,8 +114,9 @@ class _Arrays:
         packed = [lift(value, self) for value in operands]
         shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
 
-        # jax.custom_jvp accepts lists of arrays but no object arrays: pass each operand as the list of its entries
-        def flat(closed, rows):  # rows: the operands, or the operands and their tangents, so zip is not strict
+        # jax.custom_jvp accepts lists of arrays but no object arrays: pass each operand as the list of its entries;
+        # the rows are the operands, or the operands and their tangents, so zip is not strict
+        def flat(closed: jex.ClosedJaxpr, rows: Rows) -> Rows:
             arguments = [object_array(row, shape.shape) for row, shape in zip(rows, shapes * 2, strict=False)]
             return [
                 [jnp.asarray(entry, var.aval.dtype) for entry in lift(value, self).flat]
@@ -121,13 +124,14 @@ class _Arrays:
             ]
 
         @jax.custom_jvp
-        def function(*rows):
+        def function(*rows: Sequence[jax.Array]) -> Rows:
             return flat(inner, rows)
 
         @function.defjvp
         @own_settings()
-        def derivative(primals, tangents):
-            def one(*args):  # at one state, where binding the equation applies its derivative rule
+        def derivative(primals: Rows, tangents: Rows) -> tuple[Rows, Rows]:
+            # at one state, where binding the equation applies its derivative rule
+            def one(*args: jax.Array) -> tuple[list, list]:
                 half = len(args) // 2
                 return jax.jvp(lambda *state: bind(eqn, list(state)), args[:half], args[half:])
 
@@ -148,7 +152,8 @@ class _Arrays:
         shapes = [np.shape(entry) for value, v in zip(operands, varying, strict=True) if v for entry in value.flat]
         nodes = np.broadcast_shapes(*shapes)  # axes along which no operand varies stay of length 1
 
-        def gather(value, aval):  # entries that are arrays over the nodes, as one array (nodes, *shape of the operand)
+        # entries that are arrays over the nodes, as one array (nodes, *shape of the operand)
+        def gather(value: np.ndarray, aval: Any) -> jax.Array:
             entries = [jnp.broadcast_to(jnp.asarray(entry, aval.dtype), nodes).reshape(-1) for entry in value.flat]
             return jnp.stack(entries, axis=-1).reshape(math.prod(nodes), *value.shape)
 

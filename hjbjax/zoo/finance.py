@@ -46,7 +46,7 @@ class Merton:
     aversion: Number = 2.0
     discount: Number = 0.05
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         positive("merton", volatility=self.volatility, aversion=self.aversion, discount=self.discount)
         # C^{1−γ}/(1−γ) divides by zero at γ = 1; its limit up to a constant, log C, is a different problem
         if not is_traced(self.aversion) and np.any(np.asarray(self.aversion) == 1):

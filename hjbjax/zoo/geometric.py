@@ -84,7 +84,7 @@ class CarWithTrailers:
     trailers: int = 1
     lengths: Number | Sequence[Number] | Array = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # bool is a subclass of int, so True would mean one trailer
         if isinstance(self.trailers, bool) or not isinstance(self.trailers, int) or self.trailers < 1:
             raise ValueError(f"CarWithTrailers: got trailers = {self.trailers!r}, wanted a positive integer")

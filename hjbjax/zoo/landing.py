@@ -43,7 +43,7 @@ class Lander:
     consumption: Number = 0.3
     gravity: Number = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         positive("Lander", thrust=self.thrust, consumption=self.consumption, gravity=self.gravity)
 
     def drift(self, x: State, u: Control) -> State:

@@ -57,7 +57,7 @@ class Manipulator:
     # in m/s²; lengths are then in metres, masses in kilograms and torques in newton metres
     g: Number = 9.81
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # bool is a subclass of int, so True would mean one link
         if isinstance(self.links, bool) or not isinstance(self.links, int) or self.links < 1:
             raise ValueError(f"Manipulator: got links = {self.links!r}, wanted a positive integer")

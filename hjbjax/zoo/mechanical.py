@@ -41,7 +41,7 @@ class Pendulum:
     g: Number = 9.81
     as_printed: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         positive("Pendulum", mass=self.mass)
 
     @property
@@ -125,7 +125,7 @@ class FlexibleJoint:
     weight: Number = 9.81
     stiffness: Number = 10.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # the drift divides by the inertias; zero weight is allowed and describes an arm in a horizontal plane
         positive("FlexibleJoint", link=self.link, motor=self.motor)
 
@@ -163,7 +163,7 @@ class PlanarQuadrotor:
     inertia: Number = 0.1
     g: Number = 9.81
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         positive("PlanarQuadrotor", mass=self.mass, inertia=self.inertia)
 
     @property

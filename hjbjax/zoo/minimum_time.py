@@ -32,7 +32,7 @@ class DoubleIntegrator:
 
     mass: Number = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         positive("DoubleIntegrator", mass=self.mass)
 
     def drift(self, x: State, u: Control) -> State:
@@ -67,7 +67,7 @@ class Boat:
     speed: Number = 1.0
     current: Sequence[Number] | Array = (0.5, 0.0)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # the current is not checked: it may be zero or stronger than the boat
         positive("Boat", speed=self.speed)
 

@@ -32,7 +32,7 @@ class SingleIntegrator:
     speed: Number = 1.0
     norm: float = 2
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         positive("SingleIntegrator", speed=self.speed)
 
     def drift(self, x: State, u: Control) -> State:
@@ -57,7 +57,7 @@ class Dubins:
 
     speed: Number = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         positive("Dubins", speed=self.speed)
 
     def drift(self, x: State, u: Control) -> State:

@@ -37,7 +37,7 @@ class CubeExit:
     half_width: Number
     dim: int
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # the discount is not checked: 0 gives the mean exit time
         positive("brownian_exit", noise=self.noise, half_width=self.half_width)
 
@@ -89,7 +89,7 @@ class BallExit:
     radius: Number
     dim: int
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         positive("brownian_ball", noise=self.noise, radius=self.radius)
 
     def value(self, x: State) -> Scalar:
@@ -196,7 +196,7 @@ class BangBang:
     discount: Number = 1.0
     noise: Number = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # every term of V divides by λ; the noise may be zero
         positive("bang_bang", discount=self.discount)
 

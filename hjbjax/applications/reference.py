@@ -92,7 +92,7 @@ def at_nodes_of(reference: Solution | Callable, grid: Grid, mask: Mask) -> np.nd
         # clamped, because rounding may put a node of the boundary outside the other grid
         values = np.asarray(reference.value_at(grid.nodes(), clamp=True))
     else:
-        values = evaluate(reference, grid, "the reference")
+        values = _evaluate(reference, grid, "the reference")
     # NaN outside the region is harmless, and inf is a value
     missing = np.isnan(values) & mask
     if missing.any():
@@ -104,7 +104,7 @@ def at_nodes_of(reference: Solution | Callable, grid: Grid, mask: Mask) -> np.nd
     return values
 
 
-def evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence_study") -> np.ndarray:
+def _evaluate(function: Callable, grid: Grid, what: str, name: str = "convergence_study") -> np.ndarray:
     """Evaluate a function of one state at all nodes in float64; ``name`` is the caller in error messages."""
     with own_settings(x64=True):  # the accuracy of the reference must not limit the errors
         # check the shape before compiling
@@ -121,7 +121,7 @@ def mask_of(region: Callable | float | None, grid: Grid, name: str = "convergenc
     if region is None:
         return np.ones(grid.shape, bool)
     if callable(region):
-        inside = evaluate(region, grid, "the region", name).astype(bool)
+        inside = _evaluate(region, grid, "the region", name).astype(bool)
     elif isinstance(region, (int, float)) and not isinstance(region, bool):
         # bool is excluded, because True would mean the whole box
         if not 0 < region <= 1:

@@ -42,7 +42,7 @@ Energies: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # outpu
 
 
 @pytree_dataclass()
-class Lanes:
+class _Lanes:
     """Paths under the worst case or under a random signal, one row per path.
 
     Args:
@@ -168,7 +168,7 @@ def dissipation(
     )
 
 
-def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple[Lanes, list[str]]:
+def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple[_Lanes, list[str]]:
     """The paths with the worst case and with random disturbances, in this order, and the kind of each."""
     admissible, count = problem.disturbances, random * len(starts)
     assert admissible is not None
@@ -183,7 +183,7 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple
     points = least + np.repeat(strength, len(starts))[:, None, None] * away
     still = np.zeros((len(starts), POINTS, admissible.dim))
     weight = np.repeat([1.0, 0.0], [len(starts), count])
-    lanes = Lanes(np.tile(starts, (1 + random, 1)), weight, np.concatenate([still, points]))
+    lanes = _Lanes(np.tile(starts, (1 + random, 1)), weight, np.concatenate([still, points]))
     return lanes, ["worst case"] * len(starts) + ["random"] * count
 
 
@@ -212,10 +212,10 @@ def _running_cost(cost: Callable, share: Number, *arguments: Array) -> jax.Array
 
 
 @jax.jit
-def _energies(problem: Problem, solution: Solution, lanes: Lanes, times: Array, rtol: Number) -> Energies:
+def _energies(problem: Problem, solution: Solution, lanes: _Lanes, times: Array, rtol: Number) -> Energies:
     """The energy of the output, the whole cost, the last state and the status, for every lane."""
 
-    def lane(each: Lanes) -> Energies:
+    def lane(each: _Lanes) -> Energies:
         worst = as_partial(solution.disturbance_at)
         opponent = jax.tree_util.Partial(_disturbance, worst, each.weights, each.points, times[-1])
         return _path_energies(problem, solution, opponent, each.starts, times, rtol)

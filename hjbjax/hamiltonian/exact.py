@@ -29,7 +29,7 @@ from hjbjax.tracing import components
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
+class _Part:
     """One player's part of H: l·u + Σ_jk Q_jk u_j u_k and the gains of the components that it drives.
 
     Attributes:
@@ -89,7 +89,7 @@ def missed(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> 
     return sum(bounds, start=jnp.zeros(hamiltonian.value.shape, hamiltonian.on.dtype))
 
 
-def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Part:
+def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> _Part:
     """The coefficients of a player's part of H."""
     assert isinstance(player.admissible, (Box, Ball))
     on, count = hamiltonian.on, player.admissible.dim
@@ -104,10 +104,10 @@ def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> P
         components.components(player.derivative(on.problem, on.problem.drift, j), *arguments, dtype=on.dtype)
         for j in range(count)
     ]
-    return Part(hamiltonian, player, *_cost_coefficients(on, player, arguments), parts[number], slopes, noise)
+    return _Part(hamiltonian, player, *_cost_coefficients(on, player, arguments), parts[number], slopes, noise)
 
 
-def _in_ball(part: Part) -> Action:
+def _in_ball(part: _Part) -> Action:
     """The optimum over a ball whose inputs drive one component each."""
     admissible, player = part.player.admissible, part.player
     assert isinstance(admissible, Ball)
@@ -116,7 +116,7 @@ def _in_ball(part: Part) -> Action:
     return kinked_ball(player.sign, admissible.radius, part.linear, squares, gains, curved=any(player.curved))
 
 
-def _in_box(part: Part, group: Sequence[int]) -> Action:
+def _in_box(part: _Part, group: Sequence[int]) -> Action:
     """The optimum over one input of a box, or over two inputs without a product in the cost."""
     admissible, player = part.player.admissible, part.player
     assert isinstance(admissible, Box)
@@ -128,7 +128,7 @@ def _in_box(part: Part, group: Sequence[int]) -> Action:
     return piecewise_pair(player.sign, lo, hi, slope, bend, pieces, curved=curved)
 
 
-def _programmed(part: Part, group: Sequence[int]) -> tuple[Action, jax.Array]:
+def _programmed(part: _Part, group: Sequence[int]) -> tuple[Action, jax.Array]:
     """The optimum over a group of inputs as a quadratic program, and a bound on its error."""
     admissible = part.player.admissible
     assert isinstance(admissible, (Box, Ball))
@@ -152,7 +152,7 @@ def _ends(admissible: Box | Ball, group: Sequence[int]) -> tuple[list[Any], list
     return [(lo + hi) / 2 for lo, hi in pairs], [(hi - lo) / 2 for lo, hi in pairs]
 
 
-def _program(part: Part, group: Sequence[int], gains: Sequence[Kinked]) -> tuple[Program, tuple[int, ...]]:
+def _program(part: _Part, group: Sequence[int], gains: Sequence[Kinked]) -> tuple[Program, tuple[int, ...]]:
     """The coefficients of a group's part of H in unit variables, u = middle + half v, and each kink's component."""
     admissible, sign = part.player.admissible, part.player.sign
     assert isinstance(admissible, (Box, Ball))
@@ -220,7 +220,7 @@ def _barred(grid: Grid, axis: int, gain: Kinked) -> list[Any]:
     return barred
 
 
-def _bend(part: Part, j: int, k: int) -> PerNode:
+def _bend(part: _Part, j: int, k: int) -> PerNode:
     """∂²L/∂u_j∂u_k."""
     return 2 * part.square(j) if j == k else part.quadratic.get((min(j, k), max(j, k)), 0.0)
 

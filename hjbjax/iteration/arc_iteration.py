@@ -74,7 +74,7 @@ class ArcState:
     history: jax.Array  # residuals of this chunk, (HISTORY,), −1 for unused entries
 
 
-class Look(NamedTuple):
+class _Look(NamedTuple):
     """An evaluation of all arcs: the least Q, its number, and the excess of V over Q relative to the arc's cost."""
 
     worth: Field
@@ -128,18 +128,18 @@ def run(task: ArcTask, state: ArcState, until: Number) -> ArcState:
     return jax.lax.while_loop(goes_on, lambda at: _advance(task, at, start), state)
 
 
-def look(task: ArcTask, value: Field) -> Look:
+def look(task: ArcTask, value: Field) -> _Look:
     """The best arc from every node; the first one on ties."""
     wide, shape = widened(value, task.grid), task.grid.shape
 
-    def also(k: Scalar, best: Look) -> Look:
+    def also(k: Scalar, best: _Look) -> _Look:
         arcs = task.arcs.one(k)
         worth = arcs.worth(wide, task.grid)
         better, unit = worth < best.worth, _unit(arcs)
         decline = jnp.maximum(best.decline, jnp.where(unit > 0, (value - worth) / jnp.where(unit > 0, unit, 1), 0))
-        return Look(jnp.where(better, worth, best.worth), jnp.where(better, k, best.number), decline)
+        return _Look(jnp.where(better, worth, best.worth), jnp.where(better, k, best.number), decline)
 
-    none = Look(jnp.full(shape, jnp.inf, value.dtype), jnp.zeros(shape, jnp.int32), jnp.zeros(shape, value.dtype))
+    none = _Look(jnp.full(shape, jnp.inf, value.dtype), jnp.zeros(shape, jnp.int32), jnp.zeros(shape, value.dtype))
     return jax.lax.fori_loop(0, task.arcs.count, also, none)
 
 
@@ -176,7 +176,7 @@ def _relaxed(task: ArcTask, state: ArcState) -> Field:
     return jax.lax.fori_loop(0, times, follow, task.impose(state.value))
 
 
-def _bound(task: ArcTask, value: Field, found: Look) -> ErrorBound:
+def _bound(task: ArcTask, value: Field, found: _Look) -> ErrorBound:
     """The certificate of a value."""
     obstacles, free = task.obstacles, task.counted & ~task.obstacles.fixed
     left = jnp.where(free, found.worth - value, 0)

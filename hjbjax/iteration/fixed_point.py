@@ -209,7 +209,7 @@ def run(task: Task, state: State, until: Number) -> State:
         # made loop-variant, otherwise XLA compiles a kernel for every scalar of every action that it can hoist
         controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
         on = dataclasses.replace(task.on, problem=altered(task.problem, controls=controls), grid=grid)
-        return advance(dataclasses.replace(task, on=on), dataclasses.replace(state, step=count), start)
+        return _advance(dataclasses.replace(task, on=on), dataclasses.replace(state, step=count), start)
 
     state = jax.lax.while_loop(lambda at: (at.code == Status.RUNNING) & (at.step < until), step, state)
     if not task.by_defect:
@@ -217,7 +217,7 @@ def run(task: Task, state: State, until: Number) -> State:
     return dataclasses.replace(state, policy=bellman.greedy(task.on, state.value, task.obstacles.fixed))
 
 
-def advance(task: Task, state: State, start: Scalar) -> State:
+def _advance(task: Task, state: State, start: Scalar) -> State:
     """One step; it is undone if its numbers are not finite."""
     if task.bare:
         return _relaxed(task, state, start)
@@ -320,7 +320,7 @@ def _look(
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
+class _Look:
     """The view of a solve at one of its values that is passed to a method."""
 
     task: Task
@@ -371,7 +371,7 @@ def _correction(task: Task, state: State) -> Field:
 
 def _by_method(task: Task, state: State) -> Field:
     """The correction δ of the method in any step after −1."""
-    look = Look(task, state)
+    look = _Look(task, state)
     if task.method.relaxes or task.outflow is None or task.certificate is Certificate.OPEN:
         return task.method.correct(look)
     return jax.lax.cond(  # with a traced discount: without a discount the policies of a tube have no value

@@ -224,8 +224,8 @@ def run(march: March, front: Front, until: Number, most: Number) -> Front:
         front, left = carry
         if march.bare:  # made loop-variant, otherwise XLA stores arrays that depend only on the grid
             grid, front = jax.lax.optimization_barrier((march.grid, front))
-            return advance(dataclasses.replace(march, on=march.on.on_grid(grid)), front, until), left - 1
-        return advance(march, front, until), left - 1
+            return _advance(dataclasses.replace(march, on=march.on.on_grid(grid)), front, until), left - 1
+        return _advance(march, front, until), left - 1
 
     return jax.lax.while_loop(goes_on, step, (front, jnp.asarray(most, jnp.int32)))[0]
 
@@ -242,7 +242,7 @@ def _moved(front: Front, until: Scalar, count: Scalar) -> tuple[Scalar, Scalar, 
     return dt, until + after[0], after
 
 
-def advance(march: March, front: Front, until: Number) -> Front:
+def _advance(march: March, front: Front, until: Number) -> Front:
     """One step towards ``until``: the first of equal steps in the remaining time."""
     until = jnp.asarray(until, front.value.dtype)
     longest = march.longest(front.t)

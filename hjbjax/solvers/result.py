@@ -56,7 +56,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
         warn_of_no_arrival(task, state)
     state = jax.device_get(state)
     message = _message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid)
-    solution = assemble(task, state, assumptions)
+    solution = _assemble(task, state, assumptions)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
     # arrays from the device may be read-only
@@ -92,7 +92,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
 
 def _certified(settled: Settled) -> float | None:
     """The certified error bound of a monotone solution, or None."""
-    error = assemble(settled.task, jax.device_get(settled.state), settled.assumptions).error
+    error = _assemble(settled.task, jax.device_get(settled.state), settled.assumptions).error
     return None if error is None else float(error)
 
 
@@ -190,7 +190,7 @@ def with_last_phase(solution: Solution, clock: Clock) -> Solution:
     return dataclasses.replace(solution, message=f"{solution.message} It stopped during {clock.phase}.")
 
 
-def assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
+def _assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
     """The solution for a state, without the parts that require the host; pure, so that it may be traced."""
     problem = task.problem
     controls, disturbances = state.policy.controls, state.policy.disturbances

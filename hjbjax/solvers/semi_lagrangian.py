@@ -99,7 +99,7 @@ def solve_on_host(
         needed = memory.fitting(estimate(grid, plan, kind), grid, max_memory)
         node_checks.values(on, clock)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = finish(follow(on, scheme, plan, tol, times, start, clock))
+            solution = finish(_follow(on, scheme, plan, tol, times, start, clock))
     except Stopped as stop:
         return _said(solution_at_start(on, np.zeros(grid.shape) if start is None else start, stop.status), scheme)
     described = "PolicyIteration()" if method is None else method.described(False)
@@ -128,7 +128,7 @@ class Followed(NamedTuple):
     residuals: np.ndarray
 
 
-def follow(
+def _follow(
     on: Discretisation, scheme: PathScheme, plan: Plan, tol: float, times: int, guess: Nodes | None, clock: Clock
 ) -> Followed:
     """Compute the arcs of a plan and iterate on them, as far as the clock allows."""
@@ -179,7 +179,7 @@ def replace_chain(
     try:
         plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
         memory.fitting(estimate(on.grid, plan, on.dtype), on.grid, None)
-        found = follow(on, REPLACEMENT, plan, tol, relaxations(None, on.grid.ndim), guess, clock)
+        found = _follow(on, REPLACEMENT, plan, tol, relaxations(None, on.grid.ndim), guess, clock)
     except (ValueError, MemoryError):
         return None  # arcs that cost nothing, or too many of them: keep the solution of the chain
     gains = found.reached is None or bool(np.any(found.reached & ~reach.surely))

@@ -44,7 +44,7 @@ def components(function: Callable, *arguments: Any, dtype: DType) -> np.ndarray:
     Returns:
       An object array with the shape of the function's result; every entry is a per-node scalar.
     """
-    closed, packed = trace(function, *arguments, dtype=dtype)
+    closed, packed = _trace(function, *arguments, dtype=dtype)
     (result,) = evaluate(closed, packed, ARRAYS)
     entries = lift(result, ARRAYS)
     (kind,) = (each.dtype for each in closed.out_avals)
@@ -72,7 +72,7 @@ def of_state(
     return scalar(entry, *problem.state_arguments(x, t), dtype=dtype)
 
 
-def trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.ClosedJaxpr, list[np.ndarray]]:
+def _trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.ClosedJaxpr, list[np.ndarray]]:
     """The jaxpr of ``function`` on one state, and the arguments as object arrays."""
     packed = [pack(argument) for argument in arguments]
     shapes = [jax.ShapeDtypeStruct(entries.shape, dtype) for entries in packed]

@@ -97,7 +97,7 @@ def results(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> list | None:
     elif name == "dot_general" and sum(map(varies, operands)) == 1:
         found = [_contraction(eqn, operands)]
     else:
-        found = over_nodes(eqn, operands)
+        found = _over_nodes(eqn, operands)
     return [value if is_long(value.shape) else value.entries() for value in found]
 
 
@@ -138,7 +138,7 @@ def stacked(value: np.ndarray | Stack | Numbers, dtype: DType) -> Stack:
     return Stack(rows.reshape(*value.shape, *nodes), value.shape)
 
 
-def over_nodes(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> list[Stack]:
+def _over_nodes(eqn: jex.JaxprEqn, operands: Sequence[Any]) -> list[Stack]:
     """Results of any equation by ``vmap`` over the nodes, which are the last axis throughout."""
     stacks = [
         stacked(value, array_type(var).dtype) if varies(value) else value

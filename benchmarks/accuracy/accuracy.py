@@ -16,7 +16,7 @@ from benchmarks.cases import inner
 from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.peers import stationary_march
 from hjbjax.applications.convergence import fitted_order
-from hjbjax.applications.reference import at_nodes_of, distance, mask_of, mean_spacing
+from hjbjax.applications.reference import absolute_difference, at_nodes_of, mask_of, mean_spacing
 from hjbjax.zoo import catalogue
 
 COLUMNS = ("problem", "scheme", "shape", "h", "error", "mean_error", "order", "seconds", "compile_seconds", "status")
@@ -80,7 +80,7 @@ def marched(problem: Any, grids: Sequence[Any], exact: Any, *, tol: float, regio
     for grid in grids:
         run = stationary_march.march(problem, grid, exact, tol=tol, horizon=HORIZON, time_limit=TIME_LIMIT)
         mask = mask_of(region, grid)
-        off = distance(run.pop("value"), at_nodes_of(exact, grid, mask))[mask]
+        off = absolute_difference(run.pop("value"), at_nodes_of(exact, grid, mask))[mask]
         error, mean = float(np.max(off)), float(np.mean(off))
         about = {"shape": list(grid.shape), "nodes": grid.size, "h": mean_spacing(grid), "tol": tol}
         at_rest = run["moved"] <= 0.01 * error and run["status"] in ("SETTLED", "HORIZON")

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from hjbjax.applications.reference import (
+    absolute_difference,
     at_nodes_of,
-    check_box,
+    at_shared_nodes,
     check_reference,
-    distance,
+    check_same_box,
     mask_of,
     mean_spacing,
-    restrict,
+    mean_spacings,
     richardson,
-    spacings,
     words_for,
 )
 from hjbjax.discretisation.discretisation import Scheme
@@ -228,7 +228,7 @@ def convergence_study(
     extrapolated, words = None, words_for(reference, ordered)
     if reference is None:
         # all errors on the nodes of the coarsest grid, which all grids share
-        values = [restrict(value, grid, ordered[0]) for value, grid in zip(values, ordered, strict=True)]
+        values = [at_shared_nodes(value, grid, ordered[0]) for value, grid in zip(values, ordered, strict=True)]
         if clock.interrupted:
             words = "nothing: the study was interrupted"
         else:
@@ -236,7 +236,7 @@ def convergence_study(
         # without an estimate all errors are NaN, and no grid is fitted
         exact = [np.full(masks[0].shape, np.nan) if extrapolated is None else extrapolated] * len(values)
     # one array of distances per grid, over the nodes of its region
-    off = [distance(*pair)[mask] for *pair, mask in zip(values, exact, masks, strict=True)]
+    off = [absolute_difference(*pair)[mask] for *pair, mask in zip(values, exact, masks, strict=True)]
     study = Study(
         ordered,
         solutions,
@@ -293,10 +293,10 @@ def _sort(grids: Sequence[Grid] | Grid) -> tuple[Grid, ...]:
     # by the geometric mean of the spacings, so that the units of the axes do not matter
     first, *rest = ordered = sorted(grids, key=mean_spacing, reverse=True)
     for grid in rest:
-        check_box("grids of different boxes", first, grid)
+        check_same_box("grids of different boxes", first, grid)
         if repr(grid.stretch) != repr(first.stretch):  # by text, because stretch functions compare by identity
             raise ValueError(f"convergence_study: got stretch {first.stretch} and {grid.stretch}; wanted one for all")
-        ratios = spacings(first) / spacings(grid)  # (n,), the refinement factor along every axis
+        ratios = mean_spacings(first) / mean_spacings(grid)  # (n,), the refinement factor along every axis
         # intervals are integers, so allow an odd axis to deviate by 10 %
         if ratios.max() > REFINED * ratios.min():
             raise ValueError(

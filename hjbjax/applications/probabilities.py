@@ -351,7 +351,7 @@ def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)
         on = Discretisation(question, grid, scheme, kind)
-        node_checks.values(on)
+        node_checks.check_values(on)
         # the monotone chain of the scheme, because slopes of higher order have no transition probabilities
         kept = attainability.refuge(on.chain)
         return int(np.sum(np.asarray(kept)))

@@ -25,17 +25,17 @@ FLATTEST, STEEPEST = 1e-3, 16.0  # range of orders for Richardson extrapolation;
 
 def mean_spacing(grid: Grid) -> float:
     """The geometric mean of the mean spacings of the axes; ratios of two of them do not depend on the units."""
-    return float(np.prod(spacings(grid)) ** (1 / grid.ndim))  # n-th root of the cell's volume
+    return float(np.prod(mean_spacings(grid)) ** (1 / grid.ndim))  # n-th root of the cell's volume
 
 
-def spacings(grid: Grid) -> np.ndarray:
+def mean_spacings(grid: Grid) -> np.ndarray:
     """The mean spacing along every axis, shape (n,)."""
     # the mean for a stretched axis; refinement shrinks all of its spacings by about the same factor
     counts = np.array([grid.intervals(axis) for axis in range(grid.ndim)])
     return (np.asarray(grid.hi) - np.asarray(grid.lo)) / counts
 
 
-def check_box(what: str, first: Grid, second: Grid) -> None:
+def check_same_box(what: str, first: Grid, second: Grid) -> None:
     """Raise if two grids have different boxes."""
     # with the same corners, a periodic axis still makes a different box
     alike = first.periodic == second.periodic
@@ -64,9 +64,9 @@ def check_reference(reference: object, grids: tuple[Grid, ...]) -> None:
             raise ValueError(
                 f"convergence_study: the reference is {reference.status.name}; wanted a converged solution"
             )
-        check_box("a reference of another box", grids[0], reference.grid)
+        check_same_box("a reference of another box", grids[0], reference.grid)
         # the reference must be finer along every axis, so that its own error is smaller
-        if not np.all(spacings(reference.grid) < spacings(grids[-1])):
+        if not np.all(mean_spacings(reference.grid) < mean_spacings(grids[-1])):
             raise ValueError(
                 f"convergence_study: the reference is on {reference.grid.shape} nodes and the finest grid has "
                 f"{grids[-1].shape}; wanted a finer reference"
@@ -151,13 +151,13 @@ def strides(fine: Grid, coarse: Grid) -> tuple[slice, ...]:
     return tuple(slice(None, None, fine.intervals(axis) // coarse.intervals(axis)) for axis in range(fine.ndim))
 
 
-def restrict(value: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
+def at_shared_nodes(value: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
     """The values at the nodes that both grids share."""
     # no interpolation, which would add an error of the order to be measured
     return value[strides(fine, coarse)]
 
 
-def distance(value: Nodes, exact: Nodes) -> np.ndarray:
+def absolute_difference(value: Nodes, exact: Nodes) -> np.ndarray:
     """|V − W|, which is 0 for two equal infinities."""
     # ∞ − ∞ warns even in the branch that `where` discards
     with np.errstate(invalid="ignore"):
@@ -167,7 +167,7 @@ def distance(value: Nodes, exact: Nodes) -> np.ndarray:
 def richardson(values: list[np.ndarray], h: np.ndarray, mask: np.ndarray, tol: float) -> tuple[np.ndarray | None, str]:
     """The value extrapolated from three grids, or ``None`` if they show no order, and a description for the table."""
     (coarse, middle, fine), h = values, h / h[0]  # relative spacings, so that powers of order 16 do not overflow
-    wide, narrow = (float(np.mean(distance(a, b)[mask])) for a, b in ((coarse, middle), (middle, fine)))
+    wide, narrow = (float(np.mean(absolute_difference(a, b)[mask])) for a, b in ((coarse, middle), (middle, fine)))
 
     def excess(order: float) -> float:
         """The first equation of the module docstring, left minus right, times h₂^p − h₃^p; its zero is the order."""

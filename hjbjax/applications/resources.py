@@ -125,9 +125,9 @@ def estimate(
     if isinstance(scheme, PathScheme):
         scheme.check(problem, grid)
         with own_settings(x64=kind == np.float64):
-            needed, programs = semi_lagrangian.estimate(grid, scheme.plan(problem, grid, kind), kind), 1
+            needed, programs = semi_lagrangian.arc_bytes(grid, scheme.plan(problem, grid, kind), kind), 1
     else:
-        needed, programs = memory.estimate(problem, grid, chosen.inner, kind), _programs(grid, chosen, scheme)
+        needed, programs = memory.peak_bytes(problem, grid, chosen.inner, kind), _programs(grid, chosen, scheme)
     about = Estimate(grid.shape, needed, free, _largest(needed, free, grid), programs)
     if not measure:
         return dataclasses.replace(about, note="nothing was measured")
@@ -140,7 +140,9 @@ def estimate(
                 options = {"scheme": scheme, "tol": tol, "dtype": kind, "throw": False, "progress": False}
                 found.append(solve(problem, small, method=alike, **options))
         except ValueError as refusal:
-            return dataclasses.replace(about, note=f"on {memory.counts(small)} nodes: {str(refusal).splitlines()[0]}")
+            return dataclasses.replace(
+                about, note=f"on {memory.as_counts(small)} nodes: {str(refusal).splitlines()[0]}"
+            )
     coarse, fine = found
     ratio, beyond = max(tried[1].size / tried[0].size, 1 + 1e-9), grid.size / tried[1].size
     most = 2 / grid.ndim  # per step a front moves one cell, and noise needs N steps to spread over √N cells

@@ -72,7 +72,7 @@ class End:
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class ChildEnds:
     """The ends of all children.
 
     Args:
@@ -127,7 +127,7 @@ def run(
     patience: float = math.inf,
     farewell: bytes = b"",
     arrival: tuple[bytes, float] = (b"", math.inf),
-) -> Outcome:
+) -> ChildEnds:
     """Run commands in parallel until all of them have ended; pass on the output of the first one.
 
     Args:
@@ -331,9 +331,9 @@ class _Launcher:
         assert process.stdin is not None
         process.stdin.close()
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> ChildEnds:
         """The ends of all children."""
-        return Outcome(
+        return ChildEnds(
             ends=tuple(self.ends),
             interrupted=self.interrupted,
             hurried=self.hurried,

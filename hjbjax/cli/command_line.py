@@ -126,7 +126,7 @@ def say(line: str, *, after: str = "") -> None:
     stream.flush()
 
 
-def show(text: str, *, newline: bool = True) -> None:
+def print_text(text: str, *, newline: bool = True) -> None:
     """Write a text on standard output, if it is open, in the characters of its encoding.
 
     Raises:

@@ -85,7 +85,7 @@ def _pictures() -> str:
 
 def _folder() -> str:
     here = Path(placement.current_folder())
-    placement.sweep(here)  # remove leftovers of a killed command
+    placement.remove_leftovers(here)  # remove leftovers of a killed command
     # create and remove a folder, as a solve does, because permission bits do not show a full or read-only disk
     folder = here / placement.hidden_name("doctor")
     folder.mkdir()

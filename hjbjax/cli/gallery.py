@@ -61,7 +61,7 @@ class Card:
     pictures: tuple[tuple[str, bytes], ...]
 
 
-def check_folder(out: Path, force: bool = False) -> None:
+def check_page_folder(out: Path, force: bool = False) -> None:
     """Raise if a folder is not empty; with ``force`` its page may be replaced.
 
     Raises:
@@ -147,7 +147,7 @@ def _figures(problem: Problem, solution: Solution, entry: Entry) -> tuple[list[t
         plotting.closed_loop(solution, path, fixed=fixed, target=problem.target, figure=figure)
         drawn.append(("the closed loop" if solution.grid.ndim == 1 else "the value, and the closed loop on it", figure))
     if solution.policy.shape[-1]:
-        drawn.append(("the feedback", run_folder.policies(solution, fixed, jumps)))
+        drawn.append(("the feedback", run_folder.plot_policies(solution, fixed, jumps)))
     return drawn, path
 
 
@@ -248,20 +248,20 @@ def _device() -> str:
     return device.platform if device.platform == "cpu" else device.device_kind
 
 
-def publish(cards: Sequence[Card], staging: Path, out: Path, force: bool = False) -> Path:
+def publish_page(cards: Sequence[Card], staging: Path, out: Path, force: bool = False) -> Path:
     """Write the page of the cards to ``out`` atomically: write to ``staging`` on the same file system, then move.
 
     Raises:
       OSError: ``out`` cannot be written, or is no longer empty.
     """
-    made = write(cards, staging)
+    made = write_page(cards, staging)
     out.mkdir(parents=True, exist_ok=True)
-    check_folder(out, force)  # check again, because the solves may have taken long
+    check_page_folder(out, force)  # check again, because the solves may have taken long
     placement.place(made, out / PAGE, force)
     return out / PAGE
 
 
-def write(cards: Sequence[Card], folder: Path) -> Path:
+def write_page(cards: Sequence[Card], folder: Path) -> Path:
     """Write the page of the cards into a folder and return the file."""
     made = folder / PAGE
     made.write_text(page(cards), encoding="utf-8")

@@ -29,7 +29,7 @@ def end_at_once() -> None:
 
 
 @contextlib.contextmanager
-def raised() -> Iterator[None]:
+def raising_interrupts() -> Iterator[None]:
     """Context in which Ctrl-C raises ``KeyboardInterrupt`` instead of ending the process at once."""
     # only the main thread may set handlers, and a program that calls the command keeps its own handler
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not end:

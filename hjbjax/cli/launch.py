@@ -200,7 +200,7 @@ def leave() -> None:
 # --- in the launcher ---
 
 
-def check(words: Sequence[str], processes: int, heartbeat: int) -> None:
+def check_launch(words: Sequence[str], processes: int, heartbeat: int) -> None:
     """Raise if the command or a number cannot be launched.
 
     Raises:
@@ -216,7 +216,7 @@ def check(words: Sequence[str], processes: int, heartbeat: int) -> None:
             raise Failure(f"launch: got {option} {number}, wanted at most {most}")
 
 
-def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) -> int:
+def start_processes(words: Sequence[str], processes: int, heartbeat: int, result: Path) -> int:
     """Run a command of ``hjbjax`` in several processes on this host, and return its exit code.
 
     Args:
@@ -252,7 +252,7 @@ def start(words: Sequence[str], processes: int, heartbeat: int, result: Path) ->
     return code
 
 
-def _verdict(outcome: children.Outcome, way_on: str) -> int:
+def _verdict(outcome: children.ChildEnds, way_on: str) -> int:
     """The exit code of a launch.
 
     Raises:
@@ -286,7 +286,7 @@ def _verdict(outcome: children.Outcome, way_on: str) -> int:
     raise Failure(f"{name}: {culprit.words.removeprefix('hjbjax: ')}", culprit.code)
 
 
-def _killed(outcome: children.Outcome) -> str:
+def _killed(outcome: children.ChildEnds) -> str:
     """Describe which processes were killed, and why."""
     numbers = [number for number in outcome.killed if number in outcome.stopped] or outcome.killed
     which, were = ("process", "was") if len(numbers) == 1 else ("processes", "were")

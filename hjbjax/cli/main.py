@@ -35,8 +35,8 @@ from hjbjax.cli.command_line import (
     check_jax,
     names_of,
     parameters_of,
+    print_text,
     say,
-    show,
     text_of,
 )  # fmt: skip
 from hjbjax.problem import streams
@@ -75,7 +75,7 @@ def list_problems(name: str | None) -> None:
     from hjbjax.cli import listing
 
     for line in listing.overview() if name is None else listing.details(known[name]):
-        show(line)
+        print_text(line)
 
 
 @main.command(short_help="Solve a problem and plot the result.")
@@ -124,13 +124,13 @@ def solve(
     options["mesh"] = processes_of.mesh_of(devices)
     check_jax()
     if processes_of.rank() > 0:  # only the first process of a launch writes files and prints
-        with interrupts.raised(), interruptible():
+        with interrupts.raising_interrupts(), interruptible():
             _solve(*_build(entry, parameters, shape), options)
             processes_of.leave()
         return
     problem, grid = _build(entry, parameters, shape)
     with contextlib.ExitStack() as stack:  # removes the hidden folder at the end, even after an interrupt
-        stack.enter_context(interrupts.raised())
+        stack.enter_context(interrupts.raising_interrupts())
         with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
@@ -145,15 +145,15 @@ def solve(
         off = None if entry.exact is None else run_folder.difference(entry.exact(**parameters), solution)
     if as_json:
         about = {"problem": name, "parameters": parameters, "exact_difference": off}
-        show(json.dumps(run_folder.report(solution, path, files, **about)))
+        print_text(json.dumps(run_folder.json_report(solution, path, files, **about)))
     else:
-        show(str(solution))
+        print_text(str(solution))
         if off is not None:
-            show(f"off the exact answer by at most {off:.3g} on the inner half of the box")
+            print_text(f"off the exact answer by at most {off:.3g} on the inner half of the box")
         if path is not None:
-            show(f"path: {path}")
+            print_text(f"path: {path}")
         without = "" if problem.controls is not None else "; no policy.png, as there are no controls"
-        show(f"wrote {', '.join(map(text_of, files))}{without}")
+        print_text(f"wrote {', '.join(map(text_of, files))}{without}")
     if (failure := solution.stats.get("checkpoint", "written")) != "written":
         raise Failure(failure, 5)
     _raise_unless_converged(solution)
@@ -171,7 +171,7 @@ def _raise_unless_converged(solution: "Solution") -> None:
 @click.argument("words", nargs=-1, required=True, metavar="-- COMMAND")
 def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
     """Run a command in processes that split its nodes, as in "hjbjax launch --processes 2 -- solve pendulum"."""
-    processes_of.check(words, processes, heartbeat)
+    processes_of.check_launch(words, processes, heartbeat)
     # a process takes ten seconds to start, so check here what each of them would refuse
     given = solve.make_context("solve", list(words[1:]), parent=click.get_current_context().parent).params
     from hjbjax.cli import run_folder
@@ -185,8 +185,8 @@ def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
         if given["checkpoint"] is not None:
             with _one_line_error(OSError, 5, "--checkpoint: "):
                 _try_checkpoint(given["checkpoint"])
-    with interrupts.raised():
-        code = processes_of.start(words, processes, heartbeat, out / FILES[0])
+    with interrupts.raising_interrupts():
+        code = processes_of.start_processes(words, processes, heartbeat, out / FILES[0])
     if code:
         raise SystemExit(code)
 
@@ -309,7 +309,7 @@ def _estimate(problem: "Problem", grid: "Grid", options: dict[str, Any], *, as_j
     asked = {key: value for key, value in _given(options).items() if key in ("method", "scheme", "tol")}
     with _one_line_error((ValueError, TypeError), 2), _one_line_warnings():
         found = hjb.estimate(problem, grid, **asked)
-    show(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
+    print_text(json.dumps(dataclasses.asdict(found)) if as_json else str(found))
     if not found.fits:
         what = "the free memory" if found.numbered else "32-bit indices"
         raise Failure(f"the solve does not fit into {what}", 6)
@@ -390,10 +390,10 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
     from hjbjax.cli import gallery as pages
 
     with _one_line_error(OSError, 2, "--out: "):
-        pages.check_folder(out, force)
+        pages.check_page_folder(out, force)
     cards: list[pages.Card] = []
     with contextlib.ExitStack() as stack:
-        stack.enter_context(interrupts.raised())
+        stack.enter_context(interrupts.raising_interrupts())
         with _one_line_error(OSError, 2, "--out: "):
             staging = stack.enter_context(run_folder.staging(out))
         stack.enter_context(_one_line_warnings())
@@ -404,14 +404,14 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
         try:
             for number, name in enumerate(names, 1):
                 line = f"{number:>2}/{len(names)}  {name:<20}  "
-                show(line, newline=False)
+                print_text(line, newline=False)
                 cards.append(pages.card(known[name]))
                 # on a terminal the progress of the solve has overwritten the line
-                show((f"\r{line}" if streams.is_terminal(sys.stdout) else "") + cards[-1].status)
+                print_text((f"\r{line}" if streams.is_terminal(sys.stdout) else "") + cards[-1].status)
         finally:  # keep the finished cards, even after an interrupt
             if cards:
                 _publish_page(cards, staging, out, force)
-    show(f"wrote {text_of(out / pages.PAGE)}")
+    print_text(f"wrote {text_of(out / pages.PAGE)}")
     if failed := [card.name for card in cards if card.status != "CONVERGED"]:
         raise Failure(f"not converged: {', '.join(failed)}", 3)
 
@@ -422,9 +422,9 @@ def _publish_page(cards: "list[Card]", staging: Path, out: Path, force: bool) ->
     from hjbjax.cli import run_folder
 
     try:
-        pages.publish(cards, staging, out, force)
+        pages.publish_page(cards, staging, out, force)
     except OSError as error:
-        kept = run_folder.rescue(out, lambda folder: pages.write(cards, folder))
+        kept = run_folder.rescue(out, lambda folder: pages.write_page(cards, folder))
         raise Failure(f"the page could not be written: {error}; {kept}", 5) from error
 
 
@@ -435,7 +435,7 @@ def doctor() -> None:
 
     failed = 0
     for name, well, found in examine():
-        show(f"{'ok  ' if well else 'FAIL'}  {name:<10}  {found}")
+        print_text(f"{'ok  ' if well else 'FAIL'}  {name:<10}  {found}")
         failed += not well
     if failed:
         raise Failure(f"{failed} of the checks failed", 1)

@@ -25,7 +25,7 @@ from hjbjax import plotting
 from hjbjax._version import __version__
 from hjbjax.feedback.feedback import greedy_feedback
 from hjbjax.feedback.path import Path as Trajectory
-from hjbjax.feedback.path import joined
+from hjbjax.feedback.path import join_paths
 from hjbjax.feedback.simulation import simulate
 from hjbjax.plotting.maps import closed_loop_size
 from hjbjax.plotting.slices import at_states
@@ -84,7 +84,7 @@ def staging(out: Path) -> Iterator[Path]:
     whole = Path(placement.absolute(os.fspath(out)))
     # in the nearest existing folder, because moving files is atomic only on one file system, and /tmp may be another
     place = next(folder for folder in (whole, *whole.parents) if os.path.lexists(folder))
-    placement.sweep(place)
+    placement.remove_leftovers(place)
     folder = place / placement.hidden_name(out.name)
     try:
         try:
@@ -191,7 +191,7 @@ def make(
     with_curve(value, solution, fixed, jumps).save(folder / "value.png", dpi=DPI)
     yield "value.png", None
     if problem.controls is not None:
-        save_figure(policies(solution, fixed, jumps), folder / "policy.png", dpi=DPI)
+        save_figure(plot_policies(solution, fixed, jumps), folder / "policy.png", dpi=DPI)
         yield "policy.png", None
     path = None
     if solution.status == Status.CONVERGED:  # a closed loop with an unfinished feedback would be misleading
@@ -266,13 +266,13 @@ def closed_path(
             return path
         rest_problem, rest_feedback = finish
         rest = simulate(rest_problem, rest_feedback, path.states[-1], duration)
-        return joined(path, rest, float(np.asarray(problem.discount)))
+        return join_paths(path, rest, float(np.asarray(problem.discount)))
     except ValueError as error:  # for example a start outside a box that parameters made smaller
-        streams.warn(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
+        streams.warn_safely(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
         return None
 
 
-def policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
+def plot_policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
     """One plot per input, side by side."""
     count = solution.policy.shape[-1]
     figure = figure_of((NARROW[0] * max(1, count), NARROW[1]))
@@ -323,7 +323,7 @@ def difference(exact: Exact, solution: Solution) -> float | None:
     return float(off.max()) if off.size else None
 
 
-def report(solution: Solution, path: Trajectory | None, files: Sequence[Path], **about: Any) -> dict[str, Any]:
+def json_report(solution: Solution, path: Trajectory | None, files: Sequence[Path], **about: Any) -> dict[str, Any]:
     """The result for JSON: without arrays over the nodes, and with null for infinity and NaN."""
     numbers = ("steps", "residual", "error", "monotone_error", "isaacs_gap", "stats")
     off = None if solution.grid_error is None else float(np.nanmax(solution.grid_error))

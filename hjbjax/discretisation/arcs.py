@@ -121,7 +121,7 @@ def trace(on: Discretisation, plan: Plan, held: Mask, *, running: bool) -> Arcs:
     def under(action: jax.Array) -> Arcs:
         u = [action[j] for j in range(action.shape[0])]
 
-        def longer(path: Path, count: Scalar) -> tuple[Path, Arcs]:
+        def longer(path: ArcPath, count: Scalar) -> tuple[ArcPath, Arcs]:
             # the next longer arc continues where this one ends
             path = jax.lax.fori_loop(0, count, lambda _, path: leg(on, path, u, slowest), path)
             return path, _as_jumps(on, path, held, running=running)
@@ -129,7 +129,7 @@ def trace(on: Discretisation, plan: Plan, held: Mask, *, running: bool) -> Arcs:
         # keep XLA from hoisting tables of all nodes out of the loop over actions
         places, signs = jax.lax.optimization_barrier((start, level))
         zero = jnp.zeros(on.grid.shape, on.dtype)
-        return jax.lax.scan(longer, Path(places, zero, zero, signs, jnp.asarray(held)), further)[1]
+        return jax.lax.scan(longer, ArcPath(places, zero, zero, signs, jnp.asarray(held)), further)[1]
 
     found = jax.lax.map(under, jnp.asarray(plan.actions))  # (A, R, *grid)
     return jax.tree.map(lambda entry: entry.reshape(-1, *on.grid.shape), found)
@@ -145,19 +145,19 @@ def trace_chosen(on: Discretisation, plan: Plan, number: AtNodes, held: Mask) ->
     legs = jnp.asarray(plan.legs)[number % count]
     slowest = SLOWEST * _fastest(on, plan)
 
-    def further(path: Path, done: Scalar) -> tuple[Path, None]:
+    def further(path: ArcPath, done: Scalar) -> tuple[ArcPath, None]:
         moved = leg(on, path, u, slowest)
         return jax.tree.map(lambda new, old: jnp.where(done < legs, new, old), moved, path), None
 
     start = [jnp.broadcast_to(x, on.grid.shape) for x in on.coordinates()]
     level = None if on.problem.target is None else cut_cells.level(on)
     zero = jnp.zeros(on.grid.shape, on.dtype)
-    path = Path(start, zero, zero, level, jnp.asarray(held))
+    path = ArcPath(start, zero, zero, level, jnp.asarray(held))
     path = jax.lax.scan(further, path, jnp.arange(int(np.max(plan.legs))))[0]
     return _as_jumps(on, path, held, running=False)
 
 
-class Path(NamedTuple):
+class ArcPath(NamedTuple):
     """Paths: position, time and discounted cost so far, l at the position, and a flag if ended."""
 
     x: list[jax.Array]
@@ -167,7 +167,7 @@ class Path(NamedTuple):
     ended: jax.Array
 
 
-def _as_jumps(on: Discretisation, path: Path, held: Mask, *, running: bool) -> Arcs:
+def _as_jumps(on: Discretisation, path: ArcPath, held: Mask, *, running: bool) -> Arcs:
     """Complete paths, as jumps of the chain."""
     grid, problem = on.grid, on.problem
     weight, pay = jnp.exp(-problem.discount * path.time), path.cost
@@ -184,7 +184,7 @@ def _as_jumps(on: Discretisation, path: Path, held: Mask, *, running: bool) -> A
     return Arcs(pay, weight, cell, tuple(fractions), path.cost if running else None)
 
 
-def leg(on: Discretisation, path: Path, u: list[jax.Array], slowest: Scalar) -> Path:
+def leg(on: Discretisation, path: ArcPath, u: list[jax.Array], slowest: Scalar) -> ArcPath:
     """Advance the paths by one leg under an action, stopping at the target; paths that have ended stay."""
     grid, x, beta = on.grid, path.x, on.problem.discount
     shape = jnp.shape(x[0])
@@ -222,7 +222,7 @@ def leg(on: Discretisation, path: Path, u: list[jax.Array], slowest: Scalar) -> 
     weight = jnp.exp(-beta * path.time) * jnp.where(beta > 0, -jnp.expm1(-beta * lasts) / safe, lasts)
     stays = [jnp.where(path.ended, before, after) for before, after in zip(x, end, strict=True)]
     cost = path.cost + jnp.where(path.ended, 0, weight * mean_cost)
-    return Path(stays, path.time + lasts, cost, level, ended)
+    return ArcPath(stays, path.time + lasts, cost, level, ended)
 
 
 def _moved(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array], time: jax.Array) -> list[jax.Array]:

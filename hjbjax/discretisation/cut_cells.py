@@ -46,7 +46,7 @@ def level(on: Discretisation) -> Field:
 def links(on: Discretisation) -> list[Links]:
     """The links along every axis, cut at the boundary of the target if the scheme has ``subcell``."""
     problem, grid = on.problem, on.grid
-    plain = [stencil.links(grid, axis) for axis in range(grid.ndim)]
+    plain = [stencil.grid_links(grid, axis) for axis in range(grid.ndim)]
     if not on.scheme.subcell or problem.target is None:
         return plain
     if on.cut is not None:

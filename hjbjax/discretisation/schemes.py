@@ -131,7 +131,7 @@ def kinks(
     return found, [made[id(d)] for d in derivatives]
 
 
-def check(scheme: Any, name: str, grid: Grid, *, stationary: bool = False, paths: bool = False) -> None:
+def check_scheme(scheme: Any, name: str, grid: Grid, *, stationary: bool = False, paths: bool = False) -> None:
     """Refuse an object that is not a scheme, not suitable for stationary problems, or not for the grid's spacings.
 
     With ``paths`` a scheme that follows paths is accepted too.
@@ -329,7 +329,7 @@ class Weno5(Scheme):
         grid, noisy = around.on.grid, around.on.noisy_walls(around.x)
         found = slopes.weno5(around.value, grid, around.lost, noisy)
         for axis, (pair, link) in enumerate(zip(around.one_sided, around.links, strict=True)):
-            if (broken := slopes.broken(link, grid, axis, around.lost)) is not None:
+            if (broken := slopes.broken_stencils(link, grid, axis, around.lost)) is not None:
                 near, (up, down) = stencil.limited(*pair, grid, axis, link, noisy[axis]), found[axis]
                 found[axis] = jnp.where(broken, near[0], up), jnp.where(broken, near[1], down)
         return found

@@ -73,7 +73,7 @@ def weno5(values: Field, grid: Grid, lost: Mask | None = None, noisy: Noisy | No
     return result
 
 
-def broken(link: Links, grid: Grid, axis: int, lost: Mask | None = None) -> AtNodes | None:
+def broken_stencils(link: Links, grid: Grid, axis: int, lost: Mask | None = None) -> AtNodes | None:
     """The nodes whose seven values along an axis are not smooth together: some are in a target or ``lost``."""
     found = None if lost is None else _spread(jnp.asarray(lost), grid, axis, 3)
     if link.meets_up is None or link.meets_down is None:

@@ -254,7 +254,7 @@ class Links:
     meets_down: tuple[jax.Array, jax.Array] | None = None
 
 
-def links(grid: Grid, axis: int) -> Links:
+def grid_links(grid: Grid, axis: int) -> Links:
     """The links of the grid along one axis; on a stretched axis an end node repeats its only distance."""
     if grid.stretch[axis] is None:
         return Links(grid.spacing(axis), grid.spacing(axis))
@@ -269,7 +269,7 @@ def links(grid: Grid, axis: int) -> Links:
 
 def one_sided(values: Field, grid: Grid, axis: int, link: Links | None = None) -> tuple[Field, Field]:
     """The differences D⁺ = (V(x+h⁺) − V(x))/h⁺ and D⁻ = (V(x) − V(x−h⁻))/h⁻ along one axis; zero across a wall."""
-    link = link or links(grid, axis)
+    link = link or grid_links(grid, axis)
     up, down = _neighbours(values, grid, axis)
     if link.meets_up is not None:  # the link ends on a target: its exit cost replaces the neighbour's value
         up = jnp.where(*link.meets_up, up)
@@ -326,7 +326,7 @@ def van_albada(a: Field, b: Field) -> Field:
     return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
 
 
-def numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:
+def neighbour_numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:
     """The flat index of the node x + offset for every node x, shape (*grid), wrapped on all axes; host level."""
     number = np.arange(grid.size).reshape(grid.shape)
     # also wraps axes that are not periodic, because callers have zero entries there
@@ -350,7 +350,7 @@ def sparse(
     for offset, value in zip(offsets, values, strict=True):
         nonzero = np.asarray(value).ravel() != 0
         rows.append(number[nonzero])
-        columns.append(numbers(grid, offset).ravel()[nonzero])
+        columns.append(neighbour_numbers(grid, offset).ravel()[nonzero])
         entries.append(np.asarray(value, np.float64).ravel()[nonzero])
     index = (np.concatenate(rows), np.concatenate(columns))
     # coinciding entries add up, as for two jumps over the seam of an axis with two nodes

@@ -48,7 +48,9 @@ def on_mesh(
     return value[..., : len(s)], by_state[..., : len(s)], by_theta[..., : len(s)]
 
 
-def at_ends(bvp: BoundaryValueProblem, y: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def slopes_at_ends(
+    bvp: BoundaryValueProblem, y: np.ndarray, theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives of the conditions by the first column, the last column and theta."""
     by_first, by_last, by_theta = map(np.asarray, _condition_slopes(bvp, y[:, 0], y[:, -1], theta))
     return by_first, by_last, by_theta

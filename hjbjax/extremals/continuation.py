@@ -15,7 +15,7 @@ import numpy as np
 from hjbjax.extremals import initial_guess, necessary_conditions, second_order
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Limits
 from hjbjax.extremals.collocation import collocate, split_at_seams
-from hjbjax.extremals.necessary_conditions import Extremal, assemble, entry_time, last_iterate, only_touches
+from hjbjax.extremals.necessary_conditions import Extremal, assemble_extremal, entry_time, last_iterate, only_touches
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import CUT, Stopped
 from hjbjax.solution.status import Status
@@ -109,7 +109,7 @@ def carry_on(found: Outcome, limits: Limits) -> None:
         raise Stopped(code, dataclasses.replace(found, code=code))
 
 
-def smooth(
+def solve_smooth(
     bvp: BoundaryValueProblem, times: np.ndarray, columns: np.ndarray, limits: Limits, *, trusted: bool
 ) -> Outcome:
     """Solve for the extremal of a Hamiltonian whose minimiser is continuous.
@@ -247,7 +247,7 @@ def report(found: Outcome) -> Extremal:
     """The extremal, checked against the necessary conditions unless the run was cut short."""
     if found.code in CUT:
         return last_iterate(found.bvp, found.s, found.y, found.lengths, found.code)
-    extremal = assemble(found.bvp, found.s, found.y, found.theta, found.code, found.trouble)
+    extremal = assemble_extremal(found.bvp, found.s, found.y, found.theta, found.code, found.trouble)
     check = extremal.optimality_check
     if not found.solved:
         return dataclasses.replace(extremal, message=found.trouble + necessary_conditions.way_out(found.bvp))

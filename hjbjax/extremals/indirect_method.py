@@ -248,7 +248,7 @@ def _cheapest(
     begun: Sequence[tuple[BoundaryValueProblem, np.ndarray, np.ndarray]], limits: Limits, *, trusted: bool
 ) -> continuation.Outcome:
     """The cheapest of the solved problems, or the first failure if none is solved."""
-    solve = switching.switching if begun[0][0].rule.jumps else continuation.smooth
+    solve = switching.switching if begun[0][0].rule.jumps else continuation.solve_smooth
     answers: list[continuation.Outcome] = []
     for bvp, times, columns in begun:
         if answers:

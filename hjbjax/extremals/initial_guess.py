@@ -169,10 +169,10 @@ def arc_order(
     begins = begins[np.append(True, which[begins[1:]] != which[begins[:-1]])] if len(begins) else np.zeros(1, int)
     # a switch is between the last sample of one value and the first sample of the next; take the middle
     starts = np.append(times[0], 0.5 * (times[begins[1:]] + times[begins[1:] - 1]))
-    return values(bvp)[which[begins]], starts
+    return switching_values(bvp)[which[begins]], starts
 
 
-def values(bvp: BoundaryValueProblem) -> np.ndarray:
+def switching_values(bvp: BoundaryValueProblem) -> np.ndarray:
     """The values between which the control jumps, shape (K, m)."""
     return np.asarray(_corners(bvp))
 

@@ -118,7 +118,7 @@ def measure(bvp: BoundaryValueProblem, t: Array, z: Array, corner: Array) -> dic
     return jax.vmap(one, (0, 1))(t, z)
 
 
-def assemble(
+def assemble_extremal(
     bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.ndarray, code: Status, message: str
 ) -> Extremal:
     """Assemble the extremal from the functions on [0, 1] that solve ``bvp``; requires float64 mode."""

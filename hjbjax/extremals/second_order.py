@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law
-from hjbjax.extremals.collocation import at_ends, on_mesh
+from hjbjax.extremals.collocation import on_mesh, slopes_at_ends
 
 SINGULAR = 1e-6  # relative singular value of X below which W = P X⁻¹ would have no correct digits
 FLAT, STEEP = 1e-4, 1e4  # for T J'' relative to the terms of H: less is rounding, more means that T cannot change
@@ -40,7 +40,7 @@ def verdict(bvp: BoundaryValueProblem, s: np.ndarray, y: np.ndarray, theta: np.n
     both = slice(2 * bvp.n)  # the rows of x and p; no rate depends on the cost to go except its own
     _, by_state, by_theta = on_mesh(arrays, s, y, theta)
     matrices = np.moveaxis(by_state[both, both], -1, 0)[kept]
-    _, by_last, ends_by_theta = at_ends(arrays, y, theta)
+    _, by_last, ends_by_theta = slopes_at_ends(arrays, y, theta)
     closing, sliding = by_last[bvp.n :, both], ends_by_theta[bvp.n :]
     if not all(np.all(np.isfinite(part)) for part in (matrices, by_theta, closing, sliding)):
         return ""

@@ -136,7 +136,7 @@ def _with_an_empty_arc(
     bvp: BoundaryValueProblem, blurred: Outcome, order: np.ndarray, starts: np.ndarray, limits: Limits
 ) -> Outcome | None:
     """The outcome with an additional first arc that may be empty; None if no value of this arc gives a solution."""
-    for value in initial_guess.values(blurred.bvp):
+    for value in initial_guess.switching_values(blurred.bvp):
         if not np.array_equal(value, order[0], equal_nan=True):
             found = _arcs(bvp, blurred, np.concatenate([value[None], order]), np.append(0.0, starts), limits)
             if found.solved and np.min(found.lengths) > -EMPTY * found.horizon:

@@ -145,7 +145,7 @@ def _first_at(looks: tuple[Callable, ...], *where: Array) -> Array:
 
 
 @pytree_dataclass()
-class _Greedy:
+class GreedyFeedback:
     """The feedback of ``greedy_feedback``; called with (x), or (t, x) for a marched solution.
 
     It has the interface of a Solution, so ``simulate`` takes its grid, its times and its worst case from it.
@@ -202,7 +202,7 @@ class _Greedy:
 
 
 @front_door
-def greedy_feedback(problem: Problem, solution: Solution) -> _Greedy:
+def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
     """A feedback that minimises the Hamiltonian at the state, with the slopes of the solution's value there.
 
     u(x) = argmin_u max_d [L + f·DV + ½ tr(σσᵀ D²V)], exact where ``solve`` minimises exactly, and always admissible.
@@ -246,10 +246,10 @@ def greedy_feedback(problem: Problem, solution: Solution) -> _Greedy:
     m = np.shape(solution.policy)[-1:] if solution.policy is not None else (problem.controls.dim,)
     if m != (problem.controls.dim,) or (problem.is_game and solution.disturbance is None):
         raise ValueError("greedy_feedback: the solution belongs to another problem; its players differ")
-    return _Greedy(settled(problem, solution.grid.ndim), solution)
+    return GreedyFeedback(settled(problem, solution.grid.ndim), solution)
 
 
-def _minimax(greedy: _Greedy, where: tuple, costate: Array) -> tuple[Array, Array]:
+def _minimax(greedy: GreedyFeedback, where: tuple, costate: Array) -> tuple[Array, Array]:
     """Both players' actions at states of shape (..., n), each state separately, shapes (..., m) and (..., l)."""
     times, shape = where[:-1], jnp.shape(costate)  # the time and the states broadcast to the shape of the costates
     states = jnp.broadcast_to(jnp.asarray(where[-1], costate.dtype), shape).reshape(-1, shape[-1])
@@ -278,7 +278,7 @@ def _beside_a_wall(grid: Grid, states: Array) -> jax.Array:
     return found
 
 
-def _at(greedy: _Greedy, when: tuple[Number, ...], x: State, p: Costate) -> tuple[jax.Array, jax.Array]:
+def _at(greedy: GreedyFeedback, when: tuple[Number, ...], x: State, p: Costate) -> tuple[jax.Array, jax.Array]:
     """Both players' actions at one state with the costate p."""
     problem, grid = greedy.problem, greedy.grid
     n, t = grid.ndim, (when[0] if when else 0.0)

@@ -244,7 +244,7 @@ def _array(function: Callable, name: str, letters: Sequence[str], *arguments: Ar
         raise ValueError(f"simulate: {name} returned {what}, expected an array of numbers") from None
 
 
-def random_key(problem: Problem, given: Key | int | None) -> Key | None:
+def noise_key(problem: Problem, given: Key | int | None) -> Key | None:
     """The random key, from a key or a seed; refuses a key without noise, and noise without a key."""
     if problem.noise is not None and given is None:
         raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")

@@ -80,7 +80,7 @@ def measurement(h: Callable, n: int, noise: Numbers | Sequence, name: str, *, pe
             f"{name}: h(x) returned {got}, wanted floating-point numbers of shape (p,), one entry per measured "
             "quantity: x[:1] for the first state, jnp.stack([...]) for several"
         )
-    outside = indices.beyond(closed, ("x",))
+    outside = indices.first_outside(closed, ("x",))
     if outside is not None:
         raise ValueError(f"{name}: h(x) reads {outside}.\nJAX would silently use the nearest entry, or none.")
     return Measurement(function, _root(noise, shape[0], name, perfect))

@@ -99,7 +99,7 @@ class Path:
         return encodable(self.message)  # a terminal may lack a character, and print would raise
 
 
-def joined(first: Path, then: Path, discount: float) -> Path:
+def join_paths(first: Path, then: Path, discount: float) -> Path:
     """Two consecutive paths as one, with the running cost of both.
 
     Args:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, is_grid_feedback, lookups
-from hjbjax.feedback.loop import Loop, check_shapes, random_key, settled_loop, timeless
+from hjbjax.feedback.loop import Loop, check_shapes, noise_key, settled_loop, timeless
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
 from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon
 from hjbjax.problem import arguments
@@ -114,7 +114,7 @@ def simulate(
         options: Any = {"disturbance": disturbance, "time_varying": time_varying, "grid": grid, "clamp": clamp}
         times, held = _times(duration, steps, None if hold is False else hold), hold is not None and hold is not False
         return rollout(
-            problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=random_key(problem, key), hold=held,
+            problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=noise_key(problem, key), hold=held,
             rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, due=due, **options,
         )  # fmt: skip
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
@@ -129,7 +129,7 @@ def simulate(
         max_steps=arguments.count(max_steps, "simulate: max_steps"),
         held=hold is not None,
     )
-    key = random_key(problem, key)
+    key = noise_key(problem, key)
     # importing diffrax changes JAX's configuration, which is part of the key of every compiled function; do it before
     # the first compilation, otherwise the second call compiles again
     import diffrax  # noqa: F401
@@ -242,7 +242,7 @@ def rollout(
     start = jnp.asarray(x0)
     if not jnp.issubdtype(start.dtype, jnp.floating):
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
-    key = random_key(problem, key)
+    key = noise_key(problem, key)
     # numbers that functions close over become leaves, because derivative rules only cover leaves
     problem = settled(problem, start.size, start.dtype)
     if due is None:

@@ -26,7 +26,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.feedback.feedback import GridFeedback, is_grid_feedback, lookups
 from hjbjax.feedback.output_loop import Observer, OutputPath
-from hjbjax.filtering.grid_filter import Density, GridFilter, at_ends, check_box, states_of
+from hjbjax.filtering.grid_filter import Density, GridFilter, at_ends, check_within, states_of
 from hjbjax.filtering.max_plus import refined_maximum
 from hjbjax.filtering.robust_filter import RobustGridFilter
 from hjbjax.hamiltonian import pointwise
@@ -232,7 +232,7 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
             "minimum_stress; to replace a time, add a state with drift 1."
         )
     _check_stationary(solution, name)
-    check_box(solution.grid, observer.grid, name)
+    check_within(solution.grid, observer.grid, name)
     if not is_traced(solution.value) and (bad := int(np.sum(np.isnan(solution.value)))):
         raise ValueError(f"{name}: V is NaN at {bad} nodes, wanted numbers, or infinity if the target is unreachable")
     grid, n = observer.grid, observer.grid.ndim
@@ -298,7 +298,7 @@ def minimum_stress(
         kept = {each: getattr(solution, each) for each in ("value", "policy", "disturbance")}
         first = {each: array[0] for each, array in kept.items() if array is not None}
         solution = dataclasses.replace(solution, times=None, **first)
-    check_box(solution.grid, grid := observer.grid, name)
+    check_within(solution.grid, grid := observer.grid, name)
     acts = _stationary(solution if feedback is None else feedback, name)
     with _double(solution, grid), jax.ensure_compile_time_eval():
         value = solution.value_at(states_of(grid), clamp=True)

@@ -275,7 +275,7 @@ def states_of(grid: Grid) -> Array:
     return jnp.stack([jnp.broadcast_to(part, grid.shape) for part in cast(grid, dtype).components(dtype)], axis=-1)
 
 
-def check_box(known: Grid, asked: Grid, name: str) -> None:
+def check_within(known: Grid, asked: Grid, name: str) -> None:
     """Refuse a filter whose grid extends beyond the grid of the solution."""
     if known.ndim != asked.ndim or known.periodic != asked.periodic:
         raise ValueError(

@@ -58,7 +58,7 @@ class MaxPlusMarch:
     def rate(self, p: Field) -> tuple[Field, Scalar]:
         """p_t at every node, and the fastest Σ_i |v_i|/h_i."""
         on, grid = self.on, self.on.grid
-        links = tuple(stencil.links(grid, axis) for axis in range(grid.ndim))
+        links = tuple(stencil.grid_links(grid, axis) for axis in range(grid.ndim))
         one_sided = tuple(stencil.one_sided(p, grid, axis, link) for axis, link in enumerate(links))
         slopes = on.scheme.slopes(Differences(on, on.coordinates(), p, links, one_sided))
         total, speed = jnp.broadcast_to(self.source, p.shape), jnp.zeros_like(p)
@@ -88,7 +88,7 @@ class MaxPlusMarch:
             return jnp.zeros((), self.on.dtype)
         source, total = jnp.broadcast_to(source, grid.shape), jnp.zeros((), self.on.dtype)
         for axis in range(grid.ndim):
-            link = stencil.links(grid, axis)
+            link = stencil.grid_links(grid, axis)
             up, down = stencil.one_sided(source, grid, axis, link)
             slope = jnp.maximum(jnp.abs(up) / link.up, jnp.abs(down) / link.down)
             total = total + jnp.max(jnp.asarray(self.spread[axis]) * slope)

@@ -32,7 +32,7 @@ def check_question(problem: object, grid: object, scheme: Any) -> None:
             "robust_filter: got a grid with open ends, through which unknown values of p would flow in; choose "
             "edges='projected' or 'constrained'"
         )
-    schemes.check(scheme, "robust_filter: scheme", grid)
+    schemes.check_scheme(scheme, "robust_filter: scheme", grid)
     checks.of_one_state(
         Problem(problem.drift, problem.cost, problem.controls), grid.ndim, "the number of axes of the grid"
     )

@@ -77,7 +77,7 @@ def exact_optimum(hamiltonian: DiscreteHamiltonian, player: Player, join: Callab
     return action
 
 
-def missed(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> jax.Array:
+def optimum_error(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> jax.Array:
     """A bound on the distance of H at the ``exact_optimum`` to the true optimum, (*nodes), in cost per unit time.
 
     The bound follows from convexity for quadratic programs, and is zero up to rounding if the cost is convex for this
@@ -133,7 +133,7 @@ def _programmed(part: _Part, group: Sequence[int]) -> tuple[Action, jax.Array]:
     admissible = part.player.admissible
     assert isinstance(admissible, (Box, Ball))
     program, axes = _program(part, group, [part.gain(i, group) for i in shared(part.player.driven, group)])
-    v, distance = quadratic_program.least(program, axes, ball=isinstance(admissible, Ball))
+    v, distance = quadratic_program.minimise_quadratic(program, axes, ball=isinstance(admissible, Ball))
     if isinstance(admissible, Ball):
         return [admissible.radius * each for each in v], distance
     action = []

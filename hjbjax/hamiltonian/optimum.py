@@ -54,15 +54,15 @@ def optimal_value(hamiltonian: DiscreteHamiltonian) -> jax.Array:
 def missed(hamiltonian: DiscreteHamiltonian) -> tuple[Field, Field]:
     """Bounds on the error of the exact optima of the control and of the disturbance, (*grid) each, cost per unit time.
 
-    Zero except for quadratic programs, see ``exact.missed``. They do not cover optima found by a search.
+    Zero except for quadratic programs, see ``exact.optimum_error``. They do not cover optima found by a search.
     """
     players = players_of(hamiltonian.on)
     (control, disturbance), none = players.both, jnp.zeros(hamiltonian.value.shape, hamiltonian.on.dtype)
     if disturbance.admissible is None or players.decoupled:
         u, d = (_any_action(each.admissible) for each in players.both)
         return (
-            exact.missed(hamiltonian, control, lambda mine: (mine, d)) if control.programmed else none,
-            exact.missed(hamiltonian, disturbance, lambda mine: (u, mine)) if disturbance.programmed else none,
+            exact.optimum_error(hamiltonian, control, lambda mine: (mine, d)) if control.programmed else none,
+            exact.optimum_error(hamiltonian, disturbance, lambda mine: (u, mine)) if disturbance.programmed else none,
         )
     upper = players.isaacs == "upper"
     first, second = (control, disturbance) if upper else (disturbance, control)
@@ -71,7 +71,9 @@ def missed(hamiltonian: DiscreteHamiltonian) -> tuple[Field, Field]:
     points = first.admissible.points if isinstance(first.admissible, Finite) else jnp.zeros((1, 0))
 
     def against(point: jax.Array) -> Field:
-        return exact.missed(hamiltonian, second, lambda mine: (list(point), mine) if upper else (mine, list(point)))
+        return exact.optimum_error(
+            hamiltonian, second, lambda mine: (list(point), mine) if upper else (mine, list(point))
+        )
 
     worst = jnp.max(jax.lax.map(against, jnp.asarray(points, hamiltonian.on.dtype)), 0)
     return (none, worst) if upper else (worst, none)

@@ -91,7 +91,7 @@ class Best(NamedTuple):
     bound: jax.Array
 
 
-def least(program: Program, axes: tuple[int, ...], *, ball: bool) -> tuple[jax.Array, jax.Array]:
+def minimise_quadratic(program: Program, axes: tuple[int, ...], *, ball: bool) -> tuple[jax.Array, jax.Array]:
     """The minimum at every node.
 
     Args:
@@ -124,7 +124,7 @@ def least(program: Program, axes: tuple[int, ...], *, ball: bool) -> tuple[jax.A
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _least(axes: tuple[int, ...], ball: bool, program: Program) -> tuple[jax.Array, jax.Array]:
-    """``least`` on flat nodes."""
+    """``minimise_quadratic`` on flat nodes."""
     scaled, size, _, _ = _scaled(program, ball)
     best = _best(scaled, axes, ball)
     return best.point.v, size * jnp.maximum(best.value - best.bound, 0)

@@ -61,12 +61,12 @@ class ArcEquation:
 
 
 @jax.custom_jvp
-def attach(value: Field, equation: ArcEquation) -> Field:
+def attach_arcs(value: Field, equation: ArcEquation) -> Field:
     """``value``, unchanged, as a differentiable function of the numbers in ``equation``, which it solves."""
     return value
 
 
-@attach.defjvp
+@attach_arcs.defjvp
 @own_settings()
 def _attach_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
     """The value, and its tangent by one linear solve; transposition gives one transposed solve."""

@@ -94,7 +94,7 @@ def begin(task: ArcTask, guess: Nodes) -> ArcState:
     return ArcState(value, number, ErrorBound(*numbers), *books)
 
 
-def start(task: ArcTask) -> Field:
+def value_from_above(task: ArcTask) -> Field:
     """A value above the solution, from which relaxations descend, with the constraints imposed.
 
     From below, every node would first take the shortest arc, which pays least, and V would rise by one cell per

@@ -220,7 +220,7 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     return ErrorBound(below, above, jnp.where(priced, lift, jnp.inf), error, residual)
 
 
-def widened(
+def widen_bounds(
     kind: Certificate, bound: ErrorBound, missed: tuple[Field, Field], *, discount: Number, least_cost: Field | None
 ) -> ErrorBound:
     """The bounds widened by the errors of the two players' optima, (*grid) each, cost per unit time.
@@ -232,7 +232,8 @@ def widened(
         other = Certificate.NONE if least_cost is None else Certificate.MULTIPLICATIVE
         rate = jnp.where(discount > 0, discount, 1)
         with_it, without = (
-            widened(each, bound, missed, discount=rate, least_cost=least_cost) for each in (Certificate.ADDITIVE, other)
+            widen_bounds(each, bound, missed, discount=rate, least_cost=least_cost)
+            for each in (Certificate.ADDITIVE, other)
         )
         return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
     mine, theirs = missed
@@ -376,7 +377,7 @@ def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: S
     return jax.lax.cond(matters, by_size, lambda: converged(Status.RUNNING, task.tol))
 
 
-def at_rest(task: Any, state: Any, moved: Scalar, code: Scalar) -> Scalar:
+def tube_status(task: Any, state: Any, moved: Scalar, code: Scalar) -> Scalar:
     """The status after a step; a tube in which nothing moved has converged, whatever the residual of a slow node.
 
     The residual is relative to the node's own rate, the step to the fastest rate: it may be below the last place of V.

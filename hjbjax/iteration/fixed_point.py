@@ -240,7 +240,7 @@ def _advance(task: Task, state: State, start: Scalar) -> State:
         moves = certificates.moves_after(state, moved, certificates.turns_back(task.grid, change, policy.defect))
     bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
-    code = certificates.at_rest(task, state, moved, certificates.judged(task, value, bound, state.best, since))
+    code = certificates.tube_status(task, state, moved, certificates.judged(task, value, bound, state.best, since))
     found = {"value": value, "policy": policy, "fastest": fastest, "moves": moves}
     return certificates.booked(state, start, bound, code, since, **found)
 
@@ -253,7 +253,7 @@ def _relaxed(task: Task, state: State, start: Scalar) -> State:
     # the bound on the next value would require an array of its own
     code = certificates.judged(task, state.value, bound, state.best, since)
     after = jnp.where(state.step < 0, value, task.impose(value + step))
-    code = certificates.at_rest(task, state, task.grid.largest(jnp.abs(after - state.value)), code)
+    code = certificates.tube_status(task, state, task.grid.largest(jnp.abs(after - state.value)), code)
     return certificates.booked(state, start, bound, code, since, value=after)
 
 
@@ -272,7 +272,7 @@ def _relaxed_by_defect(task: Task, state: State, start: Scalar) -> State:
     return dataclasses.replace(after, policy=policy)  # also for a step that is undone, since ``run`` recomputes it
 
 
-def broken(task: Task, state: State) -> jax.Array:
+def nonfinite_nodes(task: Task, state: State) -> jax.Array:
     """The nodes where value or defect are not finite in the step that a NONFINITE state undid, bool (*grid)."""
     if task.bare:
         return ~jnp.isfinite(bellman.relaxation(task.on, task.impose(state.value))[0])

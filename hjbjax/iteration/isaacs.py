@@ -15,11 +15,11 @@ def isaacs_gap(hamiltonian: discrete.DiscreteHamiltonian, free: Mask) -> tuple[S
 
     The influence is the largest difference of H between two pairs of actions, out of nine representatives per player.
     """
-    upper, lower = extremes(hamiltonian)
+    upper, lower = minmax_and_maxmin(hamiltonian)
     return gap_between(hamiltonian, free, upper, lower), weight_of_actions(hamiltonian, free, upper, lower)
 
 
-def extremes(hamiltonian: discrete.DiscreteHamiltonian) -> tuple[Field, Field]:
+def minmax_and_maxmin(hamiltonian: discrete.DiscreteHamiltonian) -> tuple[Field, Field]:
     """min max and max min of H at the nodes."""
     upper, lower = (optimum.optimise(hamiltonian, isaacs=which)[0] for which in ("upper", "lower"))
     return upper, lower

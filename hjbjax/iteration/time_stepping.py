@@ -277,7 +277,7 @@ def _larger_gap(march: March, front: Front) -> jax.Array:
     """The gap between min max and max min before a step, if it is larger than the previous ones; (2,)."""
     hamiltonian = discrete.around(march.on.at(front.t), front.value)
     free = ~march.obstacles_at(front.t).fixed
-    upper, lower = isaacs.extremes(hamiltonian)
+    upper, lower = isaacs.minmax_and_maxmin(hamiltonian)
     gap = isaacs.gap_between(hamiltonian, free, upper, lower)
 
     def weigh() -> jax.Array:  # 81 pairs of actions, evaluated only if the gap is larger
@@ -368,7 +368,7 @@ def _faultless(march: March, value: Field, t: Number, dt: Number, seen: Seen) ->
     return fine
 
 
-def greedy(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
+def greedy_actions(march: March, value: Field, t: Number) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """The control and the disturbance at the time t, components of shape (*grid), for the Hamiltonian of the steps."""
     on = march.on.at(t)
     _, u, d = optimum.optimise(discrete.around(on, value))
@@ -385,7 +385,7 @@ def _saturates(march: March, value: Field, t: Number) -> jax.Array:
     assert isinstance(admissible, Box)
     assert march.watched is not None
     on_bound: jax.Array | bool = False
-    for j, entry in enumerate(greedy(march, value, t)[1]):
+    for j, entry in enumerate(greedy_actions(march, value, t)[1]):
         slack = NEAR * (admissible.hi[j] - admissible.lo[j])
         on_bound |= (entry <= admissible.lo[j] + slack) | (entry >= admissible.hi[j] - slack)
     return march.grid.some(on_bound & march.watched & ~march.obstacles_at(t).fixed)

@@ -19,7 +19,7 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Mask
 
 
-def values(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
+def check_constrained_ends(problem: Problem, grid: Grid, dtype: DType, t: float = 0.0) -> None:
     """Refuse a problem whose drift forces the state out across a constrained end at some node.
 
     Args:

@@ -339,7 +339,7 @@ def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
         # jumps out of fixed nodes are omitted, because the run has ended there
         leaves = ~held & np.asarray(jump)
         starts.append(np.flatnonzero(leaves))
-        ends.append(stencil.numbers(grid, offset)[leaves])
+        ends.append(stencil.neighbour_numbers(grid, offset)[leaves])
     backward = np.concatenate(ends), np.concatenate(starts)
     # the reversed jumps lead from the target to all nodes that can reach it
     graph = csr_array((np.ones(len(backward[0])), backward), shape=(grid.size + 1, grid.size + 1))

@@ -129,7 +129,7 @@ def stationary_density(
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
     moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
     probabilities = decision_process.single_law(stationary_law.classes(moves), moves, grid)
-    u, d, _ = decision_process.policies(problem, grid, policy, disturbance)
+    u, d, _ = decision_process.policy_components(problem, grid, policy, disturbance)
     with own_settings(x64=True):
         on = Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64), t)
         noise = on.diffusion(*cast((u, d), np.float64))
@@ -171,7 +171,7 @@ def transition_arrays(
       the noise.
     """
     grid.check_indices()
-    actions = decision_process.actions(problem)
+    actions = decision_process.action_table(problem)
     held, given = decision_process.target(problem, grid)
     found = (
         _checked(Discretisation(problem, grid, scheme, np.float64), list(action), None, ~held, np.finfo(np.float64).eps)
@@ -190,7 +190,7 @@ def transition_arrays(
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
     """The rates under a policy; zero on the target and at nodes without an action."""
     grid.check_indices()
-    u, d, active = decision_process.policies(problem, grid, policy, disturbance)
+    u, d, active = decision_process.policy_components(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
     # the dtype of the policy determines what counts as rounding: float32 is off by 1e-7 at an end
     kinds = [np.asarray(array).dtype for array in (policy, disturbance) if array is not None]

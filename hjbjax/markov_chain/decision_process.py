@@ -93,7 +93,7 @@ def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np
     return inside, paid
 
 
-def policies(
+def policy_components(
     problem: Problem, grid: Grid, policy: ArrayLike | None, disturbance: ArrayLike | None
 ) -> tuple[list, list, np.ndarray]:
     """The components of both players' policies, each (*grid), and the nodes where no entry is NaN."""
@@ -115,7 +115,7 @@ def _entries(action: ArrayLike | None, admissible: AdmissibleSet | None, grid: G
     return entries
 
 
-def actions(problem: Problem) -> np.ndarray:
+def action_table(problem: Problem) -> np.ndarray:
     """The K actions of a discounted decision problem, shape (K, m).
 
     Raises:

@@ -27,7 +27,7 @@ from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.types import DType
 
 
-def estimate(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
+def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
     """Bytes that a solve uses at its peak, from a count of the arrays that live at the same time.
 
     The state is the value, the remaining rate and the policy; each evaluation creates the next state while the old one
@@ -73,7 +73,7 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     one = word * (1 + actions)  # one slice; its memory is allocated when it is filled
     if not method.limited:
         inner = PolicyIteration(method.evaluation or Krylov())
-        return kept * one * grid.size + estimate(problem, grid, inner, on.dtype)
+        return kept * one * grid.size + peak_bytes(problem, grid, inner, on.dtype)
     plain = scheme.even or (not any(grid.stretch) and not (scheme.subcell and problem.target is not None))
     if scheme.monotone:
         slopes = float(n <= stencil.LONGER)
@@ -197,7 +197,7 @@ def require(problem: Problem, grid: Grid, method: Method, dtype: DType, limit: i
     Raises:
       MemoryError: the bytes do not fit; reports the estimate, the free memory, and the largest N that fits.
     """
-    return fitting(estimate(problem, grid, method, dtype), grid, limit)
+    return fitting(peak_bytes(problem, grid, method, dtype), grid, limit)
 
 
 def fitting(needed: int, grid: Grid, limit: int | None) -> int:
@@ -213,7 +213,7 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     # memory is proportional to the number of nodes
     if free is not None and needed > free:
         raise MemoryError(
-            f"{counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
+            f"{as_counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
             f"{_largest(free / needed * grid.size, grid.ndim)}; max_memory= (bytes) overrides what counts as free.\n"
             f"dtype='float32' takes about half; {NO_GRID}."
         )
@@ -228,6 +228,6 @@ def _largest(nodes: float, n: int) -> str:
     return f"About N = {largest} points per axis would fit in {n}-D"
 
 
-def counts(grid: Grid) -> str:
+def as_counts(grid: Grid) -> str:
     """The points of all axes, such as "41 x 81"."""
     return " x ".join(map(str, grid.shape))

@@ -30,7 +30,7 @@ ACTIONS = 33  # largest number of actions of one player, 9 per player in a game;
 LOOK = 10**7  # nodes times actions between two checks of the clock: about a second for a drift with some sines
 
 
-def values(on: Discretisation, clock: Clock | None = None) -> None:
+def check_values(on: Discretisation, clock: Clock | None = None) -> None:
     """Refuse a problem by its values at the nodes: NaN, an empty target, noise or drift that no chain can represent.
 
     Args:
@@ -101,7 +101,7 @@ def _representatives(admissible: sets.AdmissibleSet | None, most: int) -> np.nda
 
 
 def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock: Clock) -> bool:
-    """True if ``values`` refuses nothing; evaluates some actions at a time."""
+    """True if ``check_values`` refuses nothing; evaluates some actions at a time."""
     count, some = len(actions[0]), max(1, LOOK // on.grid.size)
     # In batches of about a second, as ten million nodes and 33 actions take half a minute. All batches use one program,
     # because first and last are arguments.
@@ -129,7 +129,7 @@ def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int |
 
 
 def _state_fails(on: Discretisation) -> Verdict:
-    """True if ``values`` refuses the values of the functions of the state."""
+    """True if ``check_values`` refuses the values of the functions of the state."""
     problem = on.problem
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
@@ -147,7 +147,7 @@ def _state_fails(on: Discretisation) -> Verdict:
 
 @jax.jit
 def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
-    """Counts and first nodes of everything that ``values`` refuses."""
+    """Counts and first nodes of everything that ``check_values`` refuses."""
     problem, grid, x = on.problem, on.grid, on.coordinates()
     found: dict[str, Any] = {}
     inside: Mask | bool = True
@@ -208,7 +208,7 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, j
     if lacking is not None:
         bad["correlation"] = lacking
     if on.scheme != Upwind():  # a custom chain
-        links = [stencil.links(on.grid, axis) for axis in range(on.grid.ndim)]
+        links = [stencil.grid_links(on.grid, axis) for axis in range(on.grid.ndim)]
         short = [
             schemes.falls_short(on.scheme.chain, part[axis], correlated_noise.along_axis(a, on.grid, axis), link)
             for part in on.drifts(u, d, x)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hjbjax.plotting.scales import set_ticks
-from hjbjax.plotting.shading import around, is_level
+from hjbjax.plotting.shading import is_level, limits_around
 from hjbjax.plotting.slices import span_of
 from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend
 from hjbjax.problem.labels import Labels
@@ -121,7 +121,7 @@ def controls(
     set_ticks(ax.yaxis, False)
     span = max((span_of(solution, i) for i in range(count)), default=0.0) if solution is not None else 0.0
     if inputs.size and is_level(inputs, span):  # otherwise the axis would show rounding errors
-        ax.set_ylim(*around(float(np.mean(inputs)), span))
+        ax.set_ylim(*limits_around(float(np.mean(inputs)), span))
     return Picture([*lines, *means, *([legend(ax)] if count > 1 or means else [])], ax)
 
 

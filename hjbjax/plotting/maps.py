@@ -10,7 +10,7 @@ import numpy as np
 
 from hjbjax.plotting.histories import controls
 from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks
-from hjbjax.plotting.shading import Look, continued, draw, frame, is_level, jumps
+from hjbjax.plotting.shading import Look, draw, fill_missing, frame, is_level, jumps
 from hjbjax.plotting.slices import (
     Cuts,
     Region,
@@ -88,7 +88,7 @@ def value(
     artists = draw(ax, section, Look("V", hidden, colorbar), regions)
     lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
     if len(lines):
-        shades = continued(section.values).T
+        shades = fill_missing(section.values).T
         style: dict[str, Any] = {"levels": lines, "colors": "white", "linewidths": 0.6, "alpha": 0.65}
         artists.append(ax.contour(*section.coordinates, shades, **style))
     return Picture(artists, ax)

@@ -55,7 +55,7 @@ def draw(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...] = (
         artists += bands(ax, section.coordinates[0], mask, look.hidden) if look.hidden else []
         known = section.values.compressed()
         if known.size and is_level(known, look.span):  # otherwise the axis would show rounding errors
-            ax.set_ylim(*around(float(np.mean(known)), look.span))
+            ax.set_ylim(*limits_around(float(np.mean(known)), look.span))
         frame(ax, section, look.label)
     else:
         frame(ax, section)
@@ -70,7 +70,7 @@ def is_level(known: np.ndarray, span: float = 0.0) -> bool:
     return bool(np.ptp(known) < FLAT * max(abs(float(np.mean(known))), span))
 
 
-def around(middle: float, span: float = 0.0) -> tuple[float, float]:
+def limits_around(middle: float, span: float = 0.0) -> tuple[float, float]:
     """The limits of the scale for a constant: half of it, or half of the span, on either side."""
     room = 0.5 * max(abs(middle), 0.0 if abs(middle) > FLAT * span else span)
     return middle - room, middle + room
@@ -94,7 +94,7 @@ def _mesh(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...]) -
     style: dict[str, Any] = {"cmap": colours, "vmin": lo, "vmax": hi, "rasterized": True}
     shading: Any = "nearest" if look.cells else "gouraud"
     # transposed, because matplotlib's rows go upwards and our first axis goes to the right
-    mesh = ax.pcolormesh(*section.coordinates, continued(values).T, shading=shading, **style)
+    mesh = ax.pcolormesh(*section.coordinates, fill_missing(values).T, shading=shading, **style)
     # outlined sets already cover their nodes, whose cells would extend beyond the outline
     unknown = mask & ~np.any([region.nodes for region in regions], axis=0) if regions else mask
     artists: list[Artist] = [mesh]
@@ -120,7 +120,7 @@ def _colours(known: np.ndarray, look: Look) -> tuple[float, float, Colormap]:
     both = colormaps["coolwarm"]
     if not look.diverging:
         if level:
-            lo, hi = around((lo + hi) / 2, look.span)
+            lo, hi = limits_around((lo + hi) / 2, look.span)
         return lo, hi if hi > lo else lo + 1.0, colormaps["viridis"]
     if lo < -EXTREME * largest and hi > EXTREME * largest:
         return -largest, largest, both
@@ -132,7 +132,7 @@ def _colours(known: np.ndarray, look: Look) -> tuple[float, float, Colormap]:
     return -largest, largest, both
 
 
-def continued(values: np.ma.MaskedArray) -> np.ndarray:
+def fill_missing(values: np.ma.MaskedArray) -> np.ndarray:
     """The values, with missing ones replaced by the nearest known value, so that the shading has no gaps."""
     mask, data = np.ma.getmaskarray(values), np.asarray(values.data, float)
     lost = ~np.isfinite(data)

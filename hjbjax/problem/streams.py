@@ -81,7 +81,7 @@ class Expendable:
         return is_terminal(self._stream)
 
 
-def warn(message: str, category: type[Warning] = UserWarning, stacklevel: int = 1) -> None:
+def warn_safely(message: str, category: type[Warning] = UserWarning, stacklevel: int = 1) -> None:
     """``warnings.warn``, without an exception if standard error cannot be written to.
 
     Raises:

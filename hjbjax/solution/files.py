@@ -27,7 +27,7 @@ from hjbjax.solution.placement import (
     Path,
     absolute,
     check_place,
-    finish,
+    flush_to_disk,
     new_file,
     path_of,
     place,
@@ -95,7 +95,7 @@ def write_whole(path: Path, fill: Callable[[IO[bytes]], object], *, force: bool 
     check_place(path, force)  # before the bytes are written, and again when the file is moved
     with new_file(path) as (temporary, stream):
         fill(stream)
-        finish(stream)
+        flush_to_disk(stream)
         place(temporary, path, force)
     _sync_folder(os.path.dirname(path))
 

@@ -68,7 +68,7 @@ class TwoGrids:
     highest: float = SECOND
 
 
-def estimate(answers: TwoGrids) -> np.ndarray:
+def estimate_error(answers: TwoGrids) -> np.ndarray:
     """Estimate |V − V_h| at the nodes, shape (*grid), in cost units; zero where V is infinite."""
     grid, coarse, value = answers.grid, answers.coarse, answers.value
     change = nested_grids.apart(nested_grids.restrict(value, grid, coarse), answers.before)
@@ -76,7 +76,7 @@ def estimate(answers: TwoGrids) -> np.ndarray:
     finite = np.isfinite(value)
     free = finite & ~answers.held
     fine = _along_axes(np.where(free, value, np.nan), grid, coarse)
-    known = nested_grids.nearest(free, grid, coarse) & np.isfinite(answers.before)
+    known = nested_grids.at_nearest_nodes(free, grid, coarse) & np.isfinite(answers.before)
     rough = _around(np.where(known, answers.before, np.nan), coarse)
     bends = _order_of_bends(fine, rough, ratio)
     if answers.chain is None:
@@ -86,7 +86,8 @@ def estimate(answers: TwoGrids) -> np.ndarray:
         order = np.interp(bends, *SMEARED)
     else:
         gain = nested_grids.apart(
-            nested_grids.nearest(value, grid, coarse), nested_grids.nearest(answers.chain, grid, coarse)
+            nested_grids.at_nearest_nodes(value, grid, coarse),
+            nested_grids.at_nearest_nodes(answers.chain, grid, coarse),
         )
         order = np.minimum(bends, _order_of_slopes(change, gain, coarse))
     order = np.minimum(order, answers.highest)

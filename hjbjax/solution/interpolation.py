@@ -93,7 +93,7 @@ def _moment(times: Array, t: Any, dtype: DType, name: str) -> Moment:
     except (TypeError, ValueError):
         raise TypeError(f"{name}: got t = {t!r}, wanted a time") from None
     times = jnp.asarray(times, dtype)
-    inside = ~beyond(times, t)
+    inside = ~times_outside(times, t)
     if len(times) == 1:
         return Moment(jnp.zeros(t.shape, int), jnp.zeros(t.shape, dtype), inside)
     # a kept time belongs to the interval that begins there, the last one to the interval that ends there
@@ -102,7 +102,7 @@ def _moment(times: Array, t: Any, dtype: DType, name: str) -> Moment:
     return Moment(before, jnp.clip(share, 0, 1), inside & ~jnp.isnan(t))
 
 
-def beyond(times: Array, t: Array) -> Any:
+def times_outside(times: Array, t: Array) -> Any:
     """True for times t outside the kept times; NaN counts as inside."""
     xp: Any = jnp if is_traced(times, t) or isinstance(times, jax.Array) else np
     times, t = xp.asarray(times), xp.asarray(t)

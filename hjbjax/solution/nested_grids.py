@@ -33,7 +33,7 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
     return with_faces_of(grid, dataclasses.replace(grid, shape=tuple(shape)))
 
 
-def telling(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
+def coarser_grid(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
     """The coarser grid for the estimate of the error of ``grid``; None if an axis has too few intervals.
 
     It has about half the intervals per axis. Every fixed node, or a fixed neighbour of it, must lie in a coarse cell
@@ -117,7 +117,7 @@ def with_faces_of(grid: Grid, coarse: Grid) -> Grid:
     return altered(coarse, faces=jax.tree.map(at_nodes, grid.faces)) if grid.faces else coarse
 
 
-def nearest(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
+def at_nearest_nodes(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
     """Node values of the finer grid at the nodes closest to the coarse nodes, (*coarse)."""
     for axis in range(fine.ndim):
         values = np.take(values, places(fine, coarse, axis), axis=axis)

@@ -112,7 +112,7 @@ def new_file(path: str) -> Iterator[tuple[str, IO[bytes]]]:
       FileError: any error of the system.
     """
     folder, name = os.path.split(path)
-    sweep(folder)
+    remove_leftovers(folder)
     temporary = os.path.join(folder, hidden_name(name))
     try:
         with open(temporary, "xb") as stream:
@@ -131,7 +131,7 @@ def new_file(path: str) -> Iterator[tuple[str, IO[bytes]]]:
             os.unlink(temporary)
 
 
-def finish(stream: IO[bytes]) -> None:
+def flush_to_disk(stream: IO[bytes]) -> None:
     """Flush all bytes to the disk; otherwise a power cut may leave the new name without content."""
     stream.flush()
     os.fsync(stream.fileno())
@@ -147,7 +147,7 @@ def try_place(path: str) -> None:
     """
     with new_file(path) as (_, stream):
         stream.write(bytes(BLOCK))
-        finish(stream)
+        flush_to_disk(stream)
         folder, old = os.stat(os.path.dirname(path)), os.stat(path)
         if folder.st_mode & stat.S_ISVTX and os.geteuid() not in (0, folder.st_uid, old.st_uid):
             raise FileError(f"{path}: cannot be written: in this folder only the owner of a file may replace it")
@@ -249,7 +249,7 @@ def claim(path: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def sweep(folder: str | os.PathLike[str]) -> None:
+def remove_leftovers(folder: str | os.PathLike[str]) -> None:
     """Remove temporary files of killed writers from a folder: files with a dead pid in their name and without a lock.
 
     Both conditions are required: the pid may belong to a process on another machine that writes into the folder, and

@@ -27,11 +27,11 @@ from hjbjax.solution.interpolation import (
     Samples,
     between,
     between_defined,
-    beyond,
     check_query,
     nearest,
     query,
     slopes_between,
+    times_outside,
 )
 from hjbjax.solution.placement import Path
 from hjbjax.solution.status import Status, warn
@@ -239,7 +239,7 @@ class Solution:
         samples = Samples(self.grid, values, self.times)
         found = query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
         known = not clamp and t is not None and not is_traced(found, t, self.times)
-        if known and np.any(late := beyond(self.times, t)):
+        if known and np.any(late := times_outside(self.times, t)):
             first, last = float(np.min(self.times)), float(np.max(self.times))
             warn(
                 f"Solution.{name}: {np.sum(late)} of {np.size(late)} times lie outside the kept times, from "

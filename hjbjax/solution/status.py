@@ -75,4 +75,4 @@ def warn(message: str, category: type[Warning] = SolveWarning) -> None:
     package, frame, level = __name__.split(".")[0], sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
         frame, level = frame.f_back, level + 1
-    streams.warn(message, category, stacklevel=level)
+    streams.warn_safely(message, category, stacklevel=level)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import arcs
-from hjbjax.discretisation.arcs import Path
+from hjbjax.discretisation.arcs import ArcPath
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem.grid import Grid
@@ -77,15 +77,15 @@ def _arrive(on: Discretisation, policy: tuple[Nodes, ...], start: list[Nodes], *
     level = components.of_state(on.problem, on.problem.target, x, on.t, on.dtype)
     zero = jnp.zeros_like(x[0])
 
-    def further(carry: tuple[Path, jax.Array]) -> tuple[Path, jax.Array]:
+    def further(carry: tuple[ArcPath, jax.Array]) -> tuple[ArcPath, jax.Array]:
         path, count = carry
         nearest = _nearest(grid, path.x)
         return arcs.leg(on, path, [action[nearest] for action in actions], slowest), count + 1
 
-    def goes_on(carry: tuple[Path, jax.Array]) -> jax.Array:
+    def goes_on(carry: tuple[ArcPath, jax.Array]) -> jax.Array:
         return (carry[1] < most) & ~jnp.all(carry[0].ended)
 
-    path = Path(x, zero, zero, level, level <= 0)
+    path = ArcPath(x, zero, zero, level, level <= 0)
     return jax.lax.while_loop(goes_on, further, (path, jnp.zeros((), jnp.int32)))[0].ended
 
 

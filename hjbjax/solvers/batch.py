@@ -62,7 +62,7 @@ from hjbjax.solvers.setup import (
     warn_unreached,
 )
 from hjbjax.solvers.stationary import check_arguments, check_limits
-from hjbjax.solvers.stationary_run import LanesRun, stacked, with_obstacles
+from hjbjax.solvers.stationary_run import LanesRun, stack_lanes, with_obstacles
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
@@ -129,7 +129,12 @@ def solve_batch(
     opened = checkpoints.open_checkpoint(
         checkpoint, lanes, grid, resume=resume, caller="solve_batch", method=method, scheme=scheme, tol=tol, dtype=kind
     )
-    with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
+    with (
+        noting_interrupts(clock),
+        host_loop.announce(clock),
+        own_settings(x64=kind == np.float64),
+        opened as kept,
+    ):
         for members in _same_program(lanes):
             first = lanes[members[0]]
             # without nesting, because the host would drive the levels of each lane
@@ -178,7 +183,7 @@ def _over_lanes(mesh: object, lanes: Sequence[Problem], grid: Grid, method: Meth
         raise ValueError("solve_batch: checkpoint= is not supported together with mesh=. Pass only one of them")
     evaluation = None if method is None else method.inner.evaluation
     calls_back = evaluation is not None and evaluation.calls_back
-    if calls_back or any(checks.calls_back(problem, grid.ndim) for problem in lanes):
+    if calls_back or any(checks.problem_calls_back(problem, grid.ndim) for problem in lanes):
         called = repr(method) if calls_back else "a function of the problem"
         raise ValueError(f"solve_batch: {called} calls Python on the host; leave out mesh")
     return known
@@ -275,8 +280,8 @@ def _solve_together(
     for name, on in lanes.items():
         try:
             with _naming(name):
-                node_checks.values(on, clock)
-                admissibility.values(on.problem, on.grid, on.dtype)
+                node_checks.check_values(on, clock)
+                admissibility.check_constrained_ends(on.problem, on.grid, on.dtype)
                 if choices.scheme:
                     on = asked[name] = dataclasses.replace(on, scheme=choose_scheme(on, method))
                 prepared[name] = prepare_on_host(on.chain, method=method, tol=tol, clock=clock)
@@ -357,7 +362,7 @@ def _iterate(
     # lanes with different certificates stop by different rules, which are part of the structure
     for members in _groups(jax.tree.structure(task) for task in tasks):
         limit = min(most, clock.max_steps)
-        run = LanesRun(stacked([tasks[i] for i in members]), stacked([starts[i] for i in members]), limit, over)
+        run = LanesRun(stack_lanes([tasks[i] for i in members]), stack_lanes([starts[i] for i in members]), limit, over)
         run.name = f"lanes {names[members[0]]} to {names[members[-1]]}, {tasks[0].grid.size} nodes each"
         run.between(host_loop.drive(run, clock), clock)  # once more, for lanes that were cut short
         for i, (state, code), residuals in zip(members, run.final, run.histories, strict=True):

@@ -20,7 +20,7 @@ from hjbjax.solvers.stationary_run import iterate
 from hjbjax.solvers.vanishing_discounts import warm
 
 
-def start(
+def first_guess(
     task: Task, scheme: Scheme, method: Method, guess: Nodes | None, clock: Clock, *, asked_again: bool
 ) -> tuple[Nodes | None, list[tuple[int, ...]]]:
     """The guess for the finest grid, from the user or from coarser grids, and the shapes of those grids.
@@ -49,12 +49,12 @@ def start(
     for level, finer in zip(coarser, grids[1:], strict=True):
         state, _, _ = iterate(level, warm(level, value, clock), clock)
         if clock.over() is not None:
-            return nested_grids.prolong(finite(level, state), level.grid, task.grid), []
-        value = nested_grids.prolong(finite(level, state), level.grid, finer)
+            return nested_grids.prolong(fill_unreachable(level, state), level.grid, task.grid), []
+        value = nested_grids.prolong(fill_unreachable(level, state), level.grid, finer)
     return value, [grid.shape for grid in grids[:-1]]
 
 
-def finite(task: Task, state: State) -> np.ndarray:
+def fill_unreachable(task: Task, state: State) -> np.ndarray:
     """The value, with unreachable nodes set to the largest other value, because huge values spoil interpolation."""
     value, counted = np.asarray(state.value), np.asarray(task.counted)
     return np.where(counted, value, np.max(value[counted])) if task.has_lost else value
@@ -66,7 +66,7 @@ def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> li
     With ``asked_again`` the next coarser grid is there in any case, if it can estimate the error of the grid.
     """
     found: list[Task] = []
-    smaller = (telling(task) if asked_again else None) or below(task.grid, method)
+    smaller = (coarser_grid_of(task) if asked_again else None) or below(task.grid, method)
     while smaller is not None and clock.over() is None:
         clock.phase = f"the preparation of {' x '.join(map(str, smaller.shape))} nodes"
         level = on_coarser(task, smaller)
@@ -83,11 +83,11 @@ def below(grid: Grid, method: Method) -> Grid | None:
     return None if smaller is None or method.coarsest is None or smaller.size < method.coarsest else smaller
 
 
-def telling(task: Task) -> Grid | None:
+def coarser_grid_of(task: Task) -> Grid | None:
     """The coarser grid for the estimate of the error of the task's grid; None if there is none."""
     # only for nodes of the finer grid it is known which of them cannot reach the target
     fixed = np.broadcast_to(np.asarray(task.obstacles.fixed), task.grid.shape)
-    return nested_grids.telling(task.grid, fixed, nested=task.has_lost)
+    return nested_grids.coarser_grid(task.grid, fixed, nested=task.has_lost)
 
 
 def on_coarser(task: Task, coarse: Grid) -> Task | None:

@@ -8,7 +8,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import Status
-from hjbjax.solvers.coarse_levels import finite, on_coarser, telling
+from hjbjax.solvers.coarse_levels import coarser_grid_of, fill_unreachable, on_coarser
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.stationary_run import iterate
 
@@ -29,15 +29,15 @@ class CoarserAnswer(NamedTuple):
 def coarser_answer(settled: Settled, clock: Clock) -> CoarserAnswer:
     """The solution on the next coarser grid, by the scheme of ``settled`` and started from its value."""
     task, fine = settled.running, settled.task.grid
-    coarse = telling(task)
+    coarse = coarser_grid_of(task)
     if coarse is None:
-        few = nested_grids.telling(fine, np.zeros(fine.shape, bool)) is None
+        few = nested_grids.coarser_grid(fine, np.zeros(fine.shape, bool)) is None
         return CoarserAnswer(None, reason=TOO_FEW if few else LOSES)
     if clock.over() is not None:
         return CoarserAnswer(None, reason=OVER)
     if (level := on_coarser(task, coarse)) is None:
         return CoarserAnswer(None, reason=LOSES)
-    value = finite(task, settled.state)  # infinite values are imposed again by the unreachable nodes
+    value = fill_unreachable(task, settled.state)  # infinite values are imposed again by the unreachable nodes
     state, code, _ = iterate(level, nested_grids.restrict(value, fine, coarse).astype(value.dtype), clock)
     if code is not Status.CONVERGED:
         return CoarserAnswer(None, reason=UNSETTLED.format(code.name))

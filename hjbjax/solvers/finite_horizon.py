@@ -154,7 +154,12 @@ def march(
         times=kept, start=start, method=method, scheme=scheme, step=step, inner=inner, policy=policy, dtype=kind,
     )  # fmt: skip
     # float64 for this call only: the caller's own programs, and other threads, keep their type
-    with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as file:
+    with (
+        noting_interrupts(clock),
+        host_loop.announce(clock),
+        own_settings(x64=kind == np.float64),
+        opened as file,
+    ):
         clock.journal = file and file.journal()
         # within a second: errors visible at a single state, and a grid that does not fit
         check_on_one_state(problem, grid, scheme)
@@ -199,7 +204,7 @@ def march_part(
     _check(problem, grid, scheme, method, None, time_limit)
     horizon, kept = _times(horizon, None)
     clock = Clock(seconds=time_limit)
-    with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=True):
+    with noting_interrupts(clock), host_loop.announce(clock), own_settings(x64=True):
         check_on_one_state(problem, grid, scheme)
         on = Discretisation(problem, grid, scheme, np.dtype(np.float64))
         memory.fitting(memory.of_march(on, len(kept), method, policy=True), grid, None)
@@ -229,17 +234,17 @@ def _on_host(
     """
     _check_nodes(on, horizon, clock)
     task = _prepare(on, horizon, method, step, inner, policy=policy)
-    slices, front, code = march_run.drive(task, horizon, kept, start, clock)
+    slices, front, code = march_run.drive_march(task, horizon, kept, start, clock)
     return task, march_run.assemble(task, on.grid, slices, front, code)
 
 
 def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:
     """Check the values of the problem's functions at all nodes, then leave the clock at the preparation."""
     problem = on.problem
-    node_checks.values(on.asking(_without_moving_target(problem)), clock)
+    node_checks.check_values(on.asking(_without_moving_target(problem)), clock)
     # a drift that depends on time may respect a constrained end at one time and not at another
     for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
-        admissibility.values(problem, on.grid, on.dtype, t)
+        admissibility.check_constrained_ends(problem, on.grid, on.dtype, t)
     clock.enter("the preparation")
 
 
@@ -254,7 +259,7 @@ def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, st
     """Refuse arguments with which no march can start, without evaluating the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         raise TypeError(f"march: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid")
-    schemes.check(scheme, "march: scheme", grid)
+    schemes.check_scheme(scheme, "march: scheme", grid)
     check_choice(method, TimeMethod, "march: method", "hjb.Explicit(...) or hjb.Implicit(...)")
     if method.monotone_only and not scheme.monotone:
         raise ValueError(f"march: Implicit(...) solves with the matrix of a chain; got {scheme!r}, wanted Upwind(...)")
@@ -321,7 +326,7 @@ def _prepare(
     left = 0.0
     if moving:
         found = time_probes.resolution(problem, grid, horizon, dtype)
-        time_probes.report(found, horizon, step)
+        time_probes.warn_of_fast_changes(found, horizon, step)
         longest, left = (found.lengths[:, None], found.left) if step is None else (step, 0.0)
     elif step is None and (looks[0] or not method.limited):
         longest = horizon / FEWEST  # rates found during the march do not limit its first steps
@@ -409,7 +414,7 @@ def _march_traced(
         (value, ok), count = time_stepping.repeat(task, value, begin, end, steps), count + steps
         fine &= ok & jnp.all(jnp.isfinite(value))
         values.append(value)
-        actions.append(time_stepping.greedy(task, value, end))
+        actions.append(time_stepping.greedy_actions(task, value, end))
     u, d = (
         jnp.stack(
             [jnp.stack(each[player], -1) if each[player] else jnp.zeros((*grid.shape, 0), kind) for each in actions]

@@ -182,7 +182,7 @@ def _stop_status(run: Run, clock: Clock) -> Status:
 
 
 @contextlib.contextmanager
-def telling(clock: Clock) -> Iterator[None]:
+def announce(clock: Clock) -> Iterator[None]:
     """Context in which a terminal shows each phase of a run as it begins, above the bar of its steps."""
     with progress_bar(clock.progress, {"bar_format": "{desc}", "desc": clock.phase, "delay": 0}) as line:
         clock.tell = None if line is None else line.set_description_str

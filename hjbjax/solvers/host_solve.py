@@ -89,8 +89,8 @@ def settled_on_host(
     start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
         # from cheap to expensive: all nodes, the ends of the box, then everything that is compiled for the grid
-        node_checks.values(on, clock)
-        admissibility.values(problem, grid, on.dtype)
+        node_checks.check_values(on, clock)
+        admissibility.check_constrained_ends(problem, grid, on.dtype)
         sharpen = choices.scheme
         if sharpen:
             on = dataclasses.replace(on, scheme=choose_scheme(on, method))
@@ -105,7 +105,7 @@ def settled_on_host(
         warn_unreached(reach, undiscounted=bool(problem.discount == 0))
     reached = None if reach is None else reach.surely
     asked_again = sharpen and choices.levels and grid.size > COARSEST and not grid.sides("open")
-    start, shapes = coarse_levels.start(task, on.scheme, method, start, clock, asked_again=asked_again)
+    start, shapes = coarse_levels.first_guess(task, on.scheme, method, start, clock, asked_again=asked_again)
     settled = settle(staged(task, on.scheme), assumptions, reached, start, clock)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):

@@ -115,7 +115,7 @@ def _with_grid_error(
     for i, before in zip(coarse.kept, first, strict=True):
         if solution.times[i] < horizon:  # V is prescribed at the horizon
             answers = TwoGrids(grid, coarse.on.grid, value[i], before, held[i % len(held)], highest=highest)
-            errors[i] = grid_error.estimate(answers)
+            errors[i] = grid_error.estimate_error(answers)
     warn_of_grid(errors, value, "nodes and steps")
     for i in np.flatnonzero(solution.times < horizon):
         errors[i] += _left(marched, value[i])
@@ -162,9 +162,9 @@ def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
     """The coarser grid for the repeated march."""
     task, everything = marched.task, np.arange(len(times))
     grid, others = task.grid, box_error.other_ends(task.problem, task.grid)
-    coarse = nested_grids.telling(grid, np.any(held, axis=0))
+    coarse = nested_grids.coarser_grid(grid, np.any(held, axis=0))
     if coarse is None:
-        reason = TOO_FEW if nested_grids.telling(grid, np.zeros(grid.shape, bool)) is None else LOSES
+        reason = TOO_FEW if nested_grids.coarser_grid(grid, np.zeros(grid.shape, bool)) is None else LOSES
     elif min(coarse.shape) < task.on.scheme.points and not task.on.scheme.monotone:
         reason = TOO_FEW
     elif marched.steps <= 1 and not task.method.limited:
@@ -214,7 +214,7 @@ def _again(
         checks_noise=False, checks_gap=False, checks_cut=False, bare=True,
     )  # fmt: skip
     kept = np.asarray(solution.times, float)[coarse.kept]
-    slices, _, code = march_run.drive(again, float(task.horizon), kept, begin, clock.beside())
+    slices, _, code = march_run.drive_march(again, float(task.horizon), kept, begin, clock.beside())
     return slices.value if code is Status.CONVERGED and np.all(np.isfinite(slices.value)) else None
 
 

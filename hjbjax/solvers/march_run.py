@@ -48,7 +48,7 @@ Feedback: TypeAlias = tuple[tuple[tuple[Field, ...], tuple[Field, ...]], jax.Arr
 @jax.jit
 def _greedy(march: March, value: Field, t: Number) -> Feedback:
     """The players' actions at the time t, the nodes on the target, and the nodes at which actions matter."""
-    u, d = time_stepping.greedy(march, value, t)
+    u, d = time_stepping.greedy_actions(march, value, t)
     obstacles = march.obstacles_at(t)
     return (u, d), obstacles.ended, obstacles.acting(value)
 
@@ -167,7 +167,7 @@ class Slices:
         return float(self.times[self.first] - self.times[self.first - 1])
 
 
-def drive(
+def drive_march(
     task: March, horizon: float, kept: np.ndarray, start: Nodes | None, clock: Clock
 ) -> tuple[Slices, Front, Status]:
     """The slices at the kept times, the last front and its status; ends at a code, the time limit, or Ctrl-C."""

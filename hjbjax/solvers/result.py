@@ -120,7 +120,7 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer
         chain=None if origin is None else np.asarray(origin.state.value),
         highest=_highest(settled),
     )
-    found = np.where(np.isfinite(value), grid_error.estimate(answers) + _left(solution, settled), 0)
+    found = np.where(np.isfinite(value), grid_error.estimate_error(answers) + _left(solution, settled), 0)
     warn_of_grid(found[None], value[None])
     return dataclasses.replace(solution, grid_error=found)
 
@@ -229,7 +229,7 @@ def _widened(task: Task, value: Field, bound: ErrorBound, kind: Certificate) -> 
         for each in optimum.missed(discrete.around(task.on, value, task.lost))
     )
     missed = (control, disturbance)
-    return certificates.widened(kind, bound, missed, discount=task.problem.discount, least_cost=task.least_cost)
+    return certificates.widen_bounds(kind, bound, missed, discount=task.problem.discount, least_cost=task.least_cost)
 
 
 def _leaving(task: Task, state: State) -> np.ndarray:
@@ -322,7 +322,7 @@ def _unbounded_message(earning: earnings.Earning, grid: Grid) -> str:
     )
 
 
-_broken = jax.jit(fixed_point.broken)
+_broken = jax.jit(fixed_point.nonfinite_nodes)
 
 
 def _not_finite_message(task: Task, state: State, grid: Grid) -> str:

@@ -6,7 +6,7 @@ from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.solution import grid_error, nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import Status
-from hjbjax.solvers.coarse_levels import finite
+from hjbjax.solvers.coarse_levels import fill_unreachable
 from hjbjax.solvers.coarser_answer import coarser_answer
 from hjbjax.solvers.order import raised
 from hjbjax.solvers.settle import Settled
@@ -54,7 +54,7 @@ def _contradiction(settled: Settled, sharp: Settled, clock: Clock) -> str | None
     The error of the monotone solution is its change from the next coarser grid over 2^q − 1, with the least order q =
     ½. Nothing is computed if the second order changed little.
     """
-    before, after = finite(settled.task, settled.state), finite(sharp.task, sharp.state)
+    before, after = fill_unreachable(settled.task, settled.state), fill_unreachable(sharp.task, sharp.state)
     moved = float(np.max(nested_grids.apart(before, after)))
     if moved <= LITTLE * float(np.ptp(before)):
         return None

@@ -68,14 +68,14 @@ def relaxations(method: Method | None, n: int) -> int:
     )
 
 
-def estimate(grid: Grid, plan: Plan, dtype: DType) -> int:
+def arc_bytes(grid: Grid, plan: Plan, dtype: DType) -> int:
     """Bytes for the arcs and the arrays computed from them, from a count of arrays that live at the same time."""
     word = np.dtype(dtype).itemsize
     each = (3 + grid.ndim) * word + 4  # pay, keep, fractions, running cost, cell
     return (each * (plan.count + 2) + 12 * word) * grid.size
 
 
-def solve_on_host(
+def solve_arcs_on_host(
     problem: Problem,
     grid: Grid,
     scheme: PathScheme,
@@ -96,10 +96,10 @@ def solve_on_host(
         check_on_one_state(problem, grid, scheme)
         plan = scheme.plan(problem, grid, kind)
         # before all nodes are checked, which takes minutes on a grid that does not fit
-        needed = memory.fitting(estimate(grid, plan, kind), grid, max_memory)
-        node_checks.values(on, clock)
+        needed = memory.fitting(arc_bytes(grid, plan, kind), grid, max_memory)
+        node_checks.check_values(on, clock)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = finish(_follow(on, scheme, plan, tol, times, start, clock))
+            solution = finish_arcs(_follow(on, scheme, plan, tol, times, start, clock))
     except Stopped as stop:
         return _said(solution_at_start(on, np.zeros(grid.shape) if start is None else start, stop.status), scheme)
     described = "PolicyIteration()" if method is None else method.described(False)
@@ -178,7 +178,7 @@ def replace_chain(
     on = dataclasses.replace(on, scheme=Upwind(), cut=None)
     try:
         plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
-        memory.fitting(estimate(on.grid, plan, on.dtype), on.grid, None)
+        memory.fitting(arc_bytes(on.grid, plan, on.dtype), on.grid, None)
         found = _follow(on, REPLACEMENT, plan, tol, relaxations(None, on.grid.ndim), guess, clock)
     except (ValueError, MemoryError):
         return None  # arcs that cost nothing, or too many of them: keep the solution of the chain
@@ -224,7 +224,7 @@ def _traced(on: Discretisation, plan: Plan, *, running: bool) -> tuple[Arcs, bel
 
 _surely_arriving = jax.jit(arc_iteration.surely_arriving)
 _without = jax.jit(arc_iteration.without)
-_start = jax.jit(arc_iteration.start)
+_start = jax.jit(arc_iteration.value_from_above)
 _run = WideJit(arc_iteration.run, donate_argnames="state")
 
 
@@ -269,7 +269,7 @@ class _Run(StatesInChunks):
         return int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
 
 
-def finish(followed: Followed) -> Solution:
+def finish_arcs(followed: Followed) -> Solution:
     """The solution at the end of a run: values, first actions of the best arcs, bounds, and their description."""
     on, scheme, plan, task, state, code, reached, residuals = followed
     problem, looked, counted = on.problem, int(state.step) >= 0, np.asarray(task.counted)
@@ -295,7 +295,7 @@ def finish(followed: Followed) -> Solution:
 
 def finish_replacement(followed: Followed) -> Solution:
     """The solution that replaces the chain's, with the reason in its message."""
-    solution = finish(followed)
+    solution = finish_arcs(followed)
     solution.stats["method"] = f"PolicyIteration(), {followed.plan.count} arcs per node"
     return dataclasses.replace(solution, message=f"{solution.message} {REASON}")
 

@@ -139,16 +139,26 @@ def solve(
         scheme=scheme, tol=tol, guess=guess, dtype=kind,
     )  # fmt: skip
     if isinstance(scheme, PathScheme):
-        with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
+        with (
+            noting_interrupts(clock),
+            host_loop.announce(clock),
+            own_settings(x64=kind == np.float64),
+            opened as kept,
+        ):
             clock.journal = kept and kept.journal()
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
-            solution = semi_lagrangian.solve_on_host(problem, grid, scheme, kind, clock=clock, **options)
+            solution = semi_lagrangian.solve_arcs_on_host(problem, grid, scheme, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
     on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh)
     choices = Choices(scheme=scheme is None, method=free, levels=free)
     # float64 for this call only: other threads, and the caller's own programs, keep their type
-    with noting_interrupts(clock), host_loop.telling(clock), own_settings(x64=kind == np.float64), opened as kept:
+    with (
+        noting_interrupts(clock),
+        host_loop.announce(clock),
+        own_settings(x64=kind == np.float64),
+        opened as kept,
+    ):
         clock.journal = kept and kept.journal()
         check_on_one_state(problem, grid, on.scheme)  # before the memory check, which reads functions
         needed = memory.require(problem, grid, method, kind, max_memory)
@@ -211,7 +221,7 @@ def check_arguments(
     if method is not None:
         check_method(method, "solve: method")
     if scheme is not None:
-        schemes.check(scheme, "solve: scheme", grid, stationary=True, paths=paths)
+        schemes.check_scheme(scheme, "solve: scheme", grid, stationary=True, paths=paths)
     arguments.positive(tol, "solve: tol", "in the units of the cost")
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
         raise ValueError(

@@ -231,7 +231,7 @@ class RunInParts(StationaryRun):
 def _calls_back(task: Task) -> bool:
     """True if a step calls Python on the host, for a solve or in a function of the user."""
     evaluation = task.method.evaluation
-    return (evaluation is not None and evaluation.calls_back) or checks.calls_back(task.problem, task.grid.ndim)
+    return (evaluation is not None and evaluation.calls_back) or checks.problem_calls_back(task.problem, task.grid.ndim)
 
 
 class Rows(NamedTuple):
@@ -342,7 +342,7 @@ class LanesRun:
         """Nothing: the result consists of the lanes that finished before this round."""
 
 
-def stacked(trees: Sequence[T]) -> T:
+def stack_lanes(trees: Sequence[T]) -> T:
     """Stack trees of the same structure, with a leading axis of lanes in every leaf."""
     return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves)), *trees)
 

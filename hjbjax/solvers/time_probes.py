@@ -77,7 +77,7 @@ def resolution(problem: Problem, grid: Grid, horizon: float, dtype: DType) -> Re
     return Resolution(horizon / PARTS / np.array(CUTS)[cuts], errors.sum(axis=1), left, pulses > PULSES)
 
 
-def report(found: Resolution, horizon: float, step: float | None) -> None:
+def warn_of_fast_changes(found: Resolution, horizon: float, step: float | None) -> None:
     """Warn of functions that change faster than the steps, or than the given step."""
     if step is None:
         if found.left > WARNS or found.unsteady:

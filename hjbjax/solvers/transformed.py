@@ -40,8 +40,7 @@ from hjbjax.solution.status import Status, keeping_warnings
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
-from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain
-from hjbjax.solvers.semi_lagrangian import finish as finish_arcs
+from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain, finish_arcs
 from hjbjax.solvers.setup import assumptions_of, check_on_one_state, choose, is_bare, prepare
 
 NOTHING = [[1.0, -np.inf], [1.0, np.inf]]  # an enclosure without information
@@ -169,7 +168,7 @@ def _on_arcs(on: Discretisation, found: Found) -> tuple[jax.Array, Greedy]:
     plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
     legs = tuple(int(leg) for leg in plan.legs)
     equation = ArcEquation(on, plan.actions, legs, found.arc, found.fixed, found.counted)
-    value = arc_adjoint.attach(found.value, equation)
+    value = arc_adjoint.attach_arcs(found.value, equation)
     actions = jnp.asarray(plan.actions, on.dtype)[found.arc // len(legs)]
     return value, Greedy(found.policy.defect, tuple(actions[..., j] for j in range(actions.shape[-1])), ())
 

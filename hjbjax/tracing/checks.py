@@ -264,7 +264,7 @@ def _lengths(problem: Problem, n: int) -> dict[str, tuple[int, ...]]:
     return {"x": (n,), "u": (_dim(problem.controls),), "d": (_dim(problem.disturbances),), "t": ()}
 
 
-def calls_back(problem: Problem, n: int) -> bool:
+def problem_calls_back(problem: Problem, n: int) -> bool:
     """True if a function of a problem calls Python while it runs."""
     lengths = _lengths(problem, n)
     with own_settings(x64=True):
@@ -299,7 +299,7 @@ def _trace_once(
         return () if isinstance(verdicts[0], str) else result
 
     closed = jax.make_jaxpr(probe)(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in lengths))
-    return verdicts[0], indices.beyond(closed, names), indices.calls_back(closed), operations(closed)
+    return verdicts[0], indices.first_outside(closed, names), indices.calls_back(closed), operations(closed)
 
 
 def _dim(admissible: sets.AdmissibleSet | None) -> int:
@@ -344,7 +344,7 @@ def over_devices(
     if traced:
         raise ValueError(f"{caller}: mesh divides the nodes at host level only; leave it out inside jit, vmap and grad")
     grid.refuse_prescribed(caller, "whose numbers are not divided over a mesh")
-    if calls_back(problem, grid.ndim):
+    if problem_calls_back(problem, grid.ndim):
         raise ValueError(
             f"{caller}: a function of the problem calls Python on the host; leave out mesh, or write it in JAX"
         )

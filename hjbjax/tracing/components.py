@@ -22,7 +22,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import indices, stacks
-from hjbjax.tracing.interpreter import evaluate, lift, pack
+from hjbjax.tracing.interpreter import evaluate_jaxpr, lift, pack
 from hjbjax.tracing.jaxprs import array_type, bind
 from hjbjax.tracing.stacks import is_components, object_array
 
@@ -45,7 +45,7 @@ def components(function: Callable, *arguments: Any, dtype: DType) -> np.ndarray:
       An object array with the shape of the function's result; every entry is a per-node scalar.
     """
     closed, packed = _trace(function, *arguments, dtype=dtype)
-    (result,) = evaluate(closed, packed, ARRAYS)
+    (result,) = evaluate_jaxpr(closed, packed, ARRAYS)
     entries = lift(result, ARRAYS)
     (kind,) = (each.dtype for each in closed.out_avals)
     if not jnp.issubdtype(kind, jnp.floating) or kind == dtype:
@@ -78,7 +78,7 @@ def _trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.Close
     shapes = [jax.ShapeDtypeStruct(entries.shape, dtype) for entries in packed]
     # JAX caches traces by function, even if a global has changed since; the marks of ``closures`` prevent this
     closed = jax.make_jaxpr(function)(*shapes)
-    if (outside := indices.beyond(closed)) is not None:  # inside jit, where it has not been checked yet
+    if (outside := indices.first_outside(closed)) is not None:  # inside jit, where it has not been checked yet
         raise ValueError(f"a function of one state reads {outside}")
     return closed, packed
 
@@ -120,7 +120,7 @@ class _Arrays:
             arguments = [object_array(row, shape.shape) for row, shape in zip(rows, shapes * 2, strict=False)]
             return [
                 [jnp.asarray(entry, var.aval.dtype) for entry in lift(value, self).flat]
-                for var, value in zip(closed.jaxpr.outvars, evaluate(closed, arguments, self), strict=True)
+                for var, value in zip(closed.jaxpr.outvars, evaluate_jaxpr(closed, arguments, self), strict=True)
             ]
 
         @jax.custom_jvp

@@ -22,7 +22,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing.interpreter import evaluate
+from hjbjax.tracing.interpreter import evaluate_jaxpr
 from hjbjax.tracing.jaxprs import array_type
 from hjbjax.tracing.operations import NONE, Operations, operations
 from hjbjax.tracing.stacks import is_components
@@ -125,7 +125,7 @@ def dependence(function: Callable, *arguments: tuple[int | None, bool], dtype: D
             entries[index] = frozenset({(number,)}) if counts else CONSTANT  # the term of this input, or no input
             number += counts
         packed.append(entries)
-    (result,) = evaluate(closed, packed, _POLYNOMIALS)
+    (result,) = evaluate_jaxpr(closed, packed, _POLYNOMIALS)
     if not is_components(result):  # a constant, which the evaluation leaves as a number
         return Dependence((CONSTANT,) * int(np.size(result)))
     return Dependence(tuple(result.reshape(-1)), operations(closed))

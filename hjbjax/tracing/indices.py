@@ -56,7 +56,7 @@ KNOWN: dict[str, Callable[..., Any]] = {
 }
 
 
-def beyond(closed: jex.ClosedJaxpr, names: Sequence[str] = ()) -> str | None:
+def first_outside(closed: jex.ClosedJaxpr, names: Sequence[str] = ()) -> str | None:
     """The first index of a jaxpr that is outside its array, in words; ``None`` if there is none.
 
     Args:
@@ -151,7 +151,7 @@ def _inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:
         for each in value if isinstance(value, (tuple, list)) else (value,):
             if jaxprs.is_closed(each):
                 found.append(each)
-            elif jaxprs.is_open(each) and name != "update_jaxpr":
+            elif jaxprs.is_open_jaxpr(each) and name != "update_jaxpr":
                 found.append(jaxprs.closed(each))
     return found
 

@@ -82,7 +82,7 @@ def lift(value: Operand, algebra: Algebra) -> np.ndarray:
     return object_array([algebra.constant(value, index) for index in np.ndindex(*shape)], shape)
 
 
-def evaluate(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebra: Algebra) -> list:
+def evaluate_jaxpr(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebra: Algebra) -> list:
     """Results of a jaxpr on object arrays.
 
     Args:
@@ -113,7 +113,7 @@ def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
         return (
             algebra.custom_jvp(eqn, inner, operands)
             if name == "custom_jvp_call"
-            else evaluate(inner, operands, algebra)
+            else evaluate_jaxpr(inner, operands, algebra)
         )
     if name == "cond" and (_are_known(operands[:1]) or not any(isinstance(value, Stack) for value in operands)):
         return _branch(eqn, operands, algebra)
@@ -208,10 +208,10 @@ def _branch(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
     index, *rest = operands
     branches = eqn.params["branches"]
     if _are_known([index]):
-        return evaluate(branches[int(np.clip(index, 0, len(branches) - 1))], rest, algebra)  # JAX clamps it, too
+        return evaluate_jaxpr(branches[int(np.clip(index, 0, len(branches) - 1))], rest, algebra)  # JAX clamps it, too
     # all branches are evaluated and ``select_n`` picks one entry, so a NaN in another branch has no effect
     index = lift(index, algebra).item()
-    outputs = [[lift(value, algebra) for value in evaluate(branch, rest, algebra)] for branch in branches]
+    outputs = [[lift(value, algebra) for value in evaluate_jaxpr(branch, rest, algebra)] for branch in branches]
     results = []
     for var, cases in zip(eqn.outvars, zip(*outputs, strict=True), strict=True):
         dtypes = [array_type(eqn.invars[0]).dtype] + [array_type(var).dtype] * len(cases)
@@ -280,7 +280,7 @@ def _contract(eqn: jex.JaxprEqn, left: np.ndarray, right: np.ndarray, algebra: A
 @functools.cache  # a solve evaluates its functions many times, and would warn every time
 def _warn_once(name: str) -> None:
     """Warn about a primitive without a rule, once per process."""
-    streams.warn(
+    streams.warn_safely(
         f"the primitive {name!r} has no component rule: the function that uses it is evaluated node by node, "
         "which is correct but slower. Entry-by-entry arithmetic on x[0], x[1], ... avoids it.",
         FallbackWarning,

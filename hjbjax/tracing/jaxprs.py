@@ -135,7 +135,7 @@ def is_closed(value: Any) -> TypeGuard[jex.ClosedJaxpr]:
     return isinstance(value, ClosedJaxpr)
 
 
-def is_open(value: Any) -> TypeGuard[jex.Jaxpr]:
+def is_open_jaxpr(value: Any) -> TypeGuard[jex.Jaxpr]:
     """True for a jaxpr without constants, or with constants stored elsewhere."""
     from jax.extend.core import Jaxpr
 

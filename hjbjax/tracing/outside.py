@@ -167,7 +167,7 @@ class _Account:
     def _parameter(self, value: object) -> None:
         if jaxprs.is_closed(value):
             self.take(value.jaxpr, value.consts)
-        elif jaxprs.is_open(value):
+        elif jaxprs.is_open_jaxpr(value):
             self.take(value, ())
         elif isinstance(value, (tuple, list)):
             self._tell(len(value))

@@ -14,7 +14,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
-from hjbjax.zoo.ingredients import Exact, OutsideCube, Scalar, admissible, answer, positive
+from hjbjax.zoo.ingredients import Exact, OutsideCube, Scalar, admissible, answer, check_positive
 
 SHARES = 0.0, 1.0  # no short selling, no borrowing
 RATES = 0.01, 0.1  # bounds of the consumption rate k; at k = 0 the cost is infinite for γ > 1
@@ -47,7 +47,7 @@ class Merton:
     discount: Number = 0.05
 
     def __post_init__(self) -> None:
-        positive("merton", volatility=self.volatility, aversion=self.aversion, discount=self.discount)
+        check_positive("merton", volatility=self.volatility, aversion=self.aversion, discount=self.discount)
         # C^{1−γ}/(1−γ) divides by zero at γ = 1; its limit up to a constant, log C, is a different problem
         if not is_traced(self.aversion) and np.any(np.asarray(self.aversion) == 1):
             raise ValueError("merton: got aversion = 1 (logarithmic utility), wanted another number > 0")

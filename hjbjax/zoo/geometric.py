@@ -16,7 +16,7 @@ import numpy as np
 
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Number, State
-from hjbjax.zoo.ingredients import positive
+from hjbjax.zoo.ingredients import check_positive
 
 
 @pytree_dataclass()
@@ -92,7 +92,7 @@ class CarWithTrailers:
             object.__setattr__(self, "lengths", (self.lengths,) * self.trailers)  # the dataclass is frozen
         if len(self._lengths) != self.trailers:
             raise ValueError(f"CarWithTrailers.lengths: got {len(self._lengths)} numbers, wanted {self.trailers}")
-        positive("CarWithTrailers", lengths=self.lengths)
+        check_positive("CarWithTrailers", lengths=self.lengths)
 
     @property
     def _lengths(self) -> Sequence[Number]:

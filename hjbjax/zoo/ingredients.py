@@ -147,7 +147,7 @@ def noise_or_none(noise: Number) -> Number | None:
     return noise if is_traced(noise) or np.any(np.asarray(noise) != 0) else None
 
 
-def positive(owner: str, **numbers: object) -> None:
+def check_positive(owner: str, **numbers: object) -> None:
     """Check that parameters are positive; traced parameters are not checked.
 
     Raises:

@@ -19,7 +19,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
-from hjbjax.zoo.ingredients import Exact, Feedback, Scalar, answer, positive
+from hjbjax.zoo.ingredients import Exact, Feedback, Scalar, answer, check_positive
 
 NEWTON = 6  # Newton steps for √E, which is nearly linear in q, so convergence is quadratic from the first step
 EXACT = 2  # the last steps carry derivatives: one for the first derivative, two for the second
@@ -44,7 +44,7 @@ class Lander:
     gravity: Number = 1.0
 
     def __post_init__(self) -> None:
-        positive("Lander", thrust=self.thrust, consumption=self.consumption, gravity=self.gravity)
+        check_positive("Lander", thrust=self.thrust, consumption=self.consumption, gravity=self.gravity)
 
     def drift(self, x: State, u: Control) -> State:
         """(v, −g + u/m, −ku)."""

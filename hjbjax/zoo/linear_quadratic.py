@@ -26,8 +26,8 @@ from hjbjax.zoo.ingredients import (
     Scalar,
     admissible,
     answer,
+    check_positive,
     noise_or_none,
-    positive,
 )
 from hjbjax.zoo.minimum_time import DoubleIntegrator
 
@@ -161,7 +161,7 @@ def double_integrator_lq_exact(
     constant = 0.0  # the noise changes only the constant c of V = x'Px + c: ½ tr(σσ'·2P) = βc
     if noise:
         # without a discount the noise costs ½ tr(σσ'·2P) per unit time indefinitely
-        positive("double_integrator_lq with noise", discount=discount)
+        check_positive("double_integrator_lq with noise", discount=discount)
         constant = noise**2 * np.trace(matrix) / discount
     # u = −b'Px/r, largest at two corners of the box
     force = 2.0 * np.sum(np.abs(b.T @ matrix)) / control_weight
@@ -236,7 +236,7 @@ def stochastic_lq_exact(
       ValueError: a weight or the discount is not positive, or the bound is active on [−2, 2].
     """
     # without a discount c = σ²p/β is infinite; without q rest costs nothing, and p is 0/0 for 2a > β
-    positive("stochastic_lq", state_weight=state_weight, control_weight=control_weight, discount=discount)
+    check_positive("stochastic_lq", state_weight=state_weight, control_weight=control_weight, discount=discount)
     quadratic = ScalarQuadratic(state_weight, 1.0 / control_weight, rate, discount, noise)
     if not is_traced(quadratic, bound):
         with jax.ensure_compile_time_eval():  # concrete numbers can be checked inside a jit of the caller, too
@@ -291,7 +291,7 @@ def lq_game_exact(*, gamma: Number = 2.0, rate: Number = 0.0, discount: Number =
       ValueError: the level is at or below the least attainable level, so the value is infinite; or u = −px or
         d = px/γ² exceeds the bound.
     """
-    positive("lq_game", gamma=gamma)
+    check_positive("lq_game", gamma=gamma)
     # traced numbers are not checked; at or below the least attainable level the formula then gives NaN or a wrong root
     if not is_traced(gamma, rate, discount):
         # coefficients of the equation in ``ScalarQuadratic`` with q = 1: 1 + 2·shifted·p − weight·p² = 0

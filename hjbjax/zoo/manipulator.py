@@ -28,7 +28,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, Control, Number, State
-from hjbjax.zoo.ingredients import QuadraticCost, positive
+from hjbjax.zoo.ingredients import QuadraticCost, check_positive
 
 Joints: TypeAlias = Sequence[Number] | Array  # one number per joint: a vector or a list of scalars
 
@@ -69,7 +69,7 @@ class Manipulator:
                 object.__setattr__(self, name, (numbers,) * self.links)
             elif len(numbers) != self.links:
                 raise ValueError(f"Manipulator.{name}: got {len(numbers)} numbers, wanted {self.links}: one per link")
-            positive("Manipulator", **{name: getattr(self, name)})
+            check_positive("Manipulator", **{name: getattr(self, name)})
 
     @property
     def _lengths(self) -> Joints:

@@ -20,7 +20,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
-from hjbjax.zoo.ingredients import QuadraticCost, QuadraticValue, positive
+from hjbjax.zoo.ingredients import QuadraticCost, QuadraticValue, check_positive
 
 
 @pytree_dataclass(static=("as_printed",))
@@ -42,7 +42,7 @@ class Pendulum:
     as_printed: bool = False
 
     def __post_init__(self) -> None:
-        positive("Pendulum", mass=self.mass)
+        check_positive("Pendulum", mass=self.mass)
 
     @property
     def gain(self) -> Number:
@@ -127,7 +127,7 @@ class FlexibleJoint:
 
     def __post_init__(self) -> None:
         # the drift divides by the inertias; zero weight is allowed and describes an arm in a horizontal plane
-        positive("FlexibleJoint", link=self.link, motor=self.motor)
+        check_positive("FlexibleJoint", link=self.link, motor=self.motor)
 
     def drift(self, x: State, u: Control) -> State:
         """(q̇₁, −(MgL sin q₁ + k(q₁ − q₂))/I, q̇₂, (k(q₁ − q₂) + u)/J)."""
@@ -164,7 +164,7 @@ class PlanarQuadrotor:
     g: Number = 9.81
 
     def __post_init__(self) -> None:
-        positive("PlanarQuadrotor", mass=self.mass, inertia=self.inertia)
+        check_positive("PlanarQuadrotor", mass=self.mass, inertia=self.inertia)
 
     @property
     def hover(self) -> Number:

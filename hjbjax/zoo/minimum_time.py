@@ -19,7 +19,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Control, Number, State
-from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, root, unit_cost
+from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, check_positive, root, unit_cost
 
 
 @pytree_dataclass()
@@ -33,7 +33,7 @@ class DoubleIntegrator:
     mass: Number = 1.0
 
     def __post_init__(self) -> None:
-        positive("DoubleIntegrator", mass=self.mass)
+        check_positive("DoubleIntegrator", mass=self.mass)
 
     def drift(self, x: State, u: Control) -> State:
         """(x₂, u/m)."""
@@ -69,7 +69,7 @@ class Boat:
 
     def __post_init__(self) -> None:
         # the current is not checked: it may be zero or stronger than the boat
-        positive("Boat", speed=self.speed)
+        check_positive("Boat", speed=self.speed)
 
     def drift(self, x: State, u: Control) -> State:
         """c + s·u."""

@@ -16,7 +16,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.types import Control, Number, State
-from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, positive, root, unit_cost
+from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, check_positive, root, unit_cost
 
 
 # static, because the norm selects a formula
@@ -33,7 +33,7 @@ class SingleIntegrator:
     norm: float = 2
 
     def __post_init__(self) -> None:
-        positive("SingleIntegrator", speed=self.speed)
+        check_positive("SingleIntegrator", speed=self.speed)
 
     def drift(self, x: State, u: Control) -> State:
         """s·u."""
@@ -58,7 +58,7 @@ class Dubins:
     speed: Number = 1.0
 
     def __post_init__(self) -> None:
-        positive("Dubins", speed=self.speed)
+        check_positive("Dubins", speed=self.speed)
 
     def drift(self, x: State, u: Control) -> State:
         """(s cos θ, s sin θ, u)."""

@@ -14,7 +14,16 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
-from hjbjax.zoo.ingredients import Exact, OutsideBall, OutsideCube, Scalar, answer, noise_or_none, positive, unit_cost
+from hjbjax.zoo.ingredients import (
+    Exact,
+    OutsideBall,
+    OutsideCube,
+    Scalar,
+    answer,
+    check_positive,
+    noise_or_none,
+    unit_cost,
+)
 
 TERMS = 200  # of the series for the square; the remainder is 1e-15 inside and at most 1e-6, where terms fall like k⁻³
 
@@ -39,7 +48,7 @@ class CubeExit:
 
     def __post_init__(self) -> None:
         # the discount is not checked: 0 gives the mean exit time
-        positive("brownian_exit", noise=self.noise, half_width=self.half_width)
+        check_positive("brownian_exit", noise=self.noise, half_width=self.half_width)
 
     def value(self, x: State) -> Scalar:
         """The value at one state; zero outside the cube, where the run has ended."""
@@ -90,7 +99,7 @@ class BallExit:
     dim: int
 
     def __post_init__(self) -> None:
-        positive("brownian_ball", noise=self.noise, radius=self.radius)
+        check_positive("brownian_ball", noise=self.noise, radius=self.radius)
 
     def value(self, x: State) -> Scalar:
         """The value at one state; outside the ball the same formula, which is negative there."""
@@ -118,7 +127,7 @@ def brownian_exit(
       shape: number of nodes per axis; ``None`` is 101 in one dimension, 41 per axis otherwise.
     """
     # check first, otherwise a half width ≤ 0 would be reported as a wrong corner of the grid
-    positive("brownian_exit", noise=noise, half_width=half_width)
+    check_positive("brownian_exit", noise=noise, half_width=half_width)
     problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
     # odd numbers put a node at the centre
     shape = ((101,) if dim == 1 else (41,) * dim) if shape is None else shape
@@ -198,7 +207,7 @@ class BangBang:
 
     def __post_init__(self) -> None:
         # every term of V divides by λ; the noise may be zero
-        positive("bang_bang", discount=self.discount)
+        check_positive("bang_bang", discount=self.discount)
 
     def drift(self, x: State, u: Control) -> State:
         """The control itself."""

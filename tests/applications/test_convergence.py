@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import hjbjax as hjb
 from hjbjax import plotting, zoo
 from hjbjax.applications.convergence import Study, fitted_order
-from hjbjax.applications.reference import distance, mask_of, richardson
+from hjbjax.applications.reference import absolute_difference, mask_of, richardson
 from hjbjax.plotting.style import few
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -141,7 +141,7 @@ def test_without_an_order_to_be_seen_there_is_no_estimate(steps):
 
 def test_infinities():
     inf = np.inf
-    assert distance(np.array([inf, inf, 1.0]), np.array([inf, 1.0, 3.0])).tolist() == [0.0, inf, 2.0]
+    assert absolute_difference(np.array([inf, inf, 1.0]), np.array([inf, 1.0, 3.0])).tolist() == [0.0, inf, 2.0]
     assert np.isnan(fitted_order([0.2, 0.1], [inf, 1.0]))
 
 

@@ -475,7 +475,7 @@ def test_a_grid_that_does_not_fit_is_refused_before_any_node_is_looked_at(ask, m
     def looked(*arguments, **options):
         raise AssertionError
 
-    monkeypatch.setattr(probabilities.node_checks, "values", looked)
+    monkeypatch.setattr(probabilities.node_checks, "check_values", looked)
     options = {"greatest": True} if ask is hjb.expected_exit_time else {}
     with pytest.raises(MemoryError, match=r"41 nodes need about"):
         ask(hjb.Problem(pushed, controls=UNIT), interval(41), above_one, max_memory=100, **options)

@@ -14,7 +14,7 @@ from hjbjax.markov_chain import memory
 def test_bytes_alone_cost_nothing_whatever_the_size():
     problem, grid = zoo.manipulator(links=2, shape=(700,) * 4)
     found = hjb.estimate(problem, grid, measure=False)
-    assert found.bytes == memory.estimate(problem, grid, hjb.PolicyIteration(hjb.Sweeps()), np.float64)
+    assert found.bytes == memory.peak_bytes(problem, grid, hjb.PolicyIteration(hjb.Sweeps()), np.float64)
     assert not found.fits
     assert math.prod(found.shape) == 700**4
     assert found.free < found.bytes

@@ -20,7 +20,7 @@ import cheap_launch
 import pytest
 
 from hjbjax.cli import children
-from hjbjax.cli.children import End, Outcome
+from hjbjax.cli.children import ChildEnds, End
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="processes are found in /proc")
 LIMIT = 60  # seconds: a wait that is longer is a failure
@@ -194,7 +194,7 @@ def test_a_stopped_child_is_the_culprit_and_not_the_one_that_fails_for_want_of_i
     ],
 )
 def test_who_is_the_culprit(codes, more, culprit):
-    outcome = Outcome(tuple(End(number, code) for number, code in codes), **more)
+    outcome = ChildEnds(tuple(End(number, code) for number, code in codes), **more)
     assert (outcome.culprit and outcome.culprit.number) == culprit
 
 

@@ -284,7 +284,7 @@ def test_a_report_has_null_for_what_json_cannot_say():
     solution = answer(
         problem, grid, stats={"tol": np.float64(np.nan), "seconds": np.float32(0.5), "on": np.bool_(True)}
     )
-    report = run_folder.report(solution, None, [])
+    report = run_folder.json_report(solution, None, [])
     assert report["stats"] == {"tol": None, "seconds": 0.5, "on": True}
     assert (report["trajectory"], report["error"]) == (None, None)
     assert strict(json.dumps(report, allow_nan=False)) == report
@@ -350,7 +350,7 @@ def test_force_replaces_all_and_takes_stale_files_away(solver, folder):
 @pytest.mark.parametrize("file", run_folder.FILES)
 def test_a_full_disk_leaves_no_half_file(solver, folder, monkeypatch, file):
     """The old files stay whole where the new one cannot be written, and what came out whole before is kept."""
-    finish = placement.finish
+    finish = placement.flush_to_disk
 
     def full(stream):
         finish(stream)
@@ -362,7 +362,7 @@ def test_a_full_disk_leaves_no_half_file(solver, folder, monkeypatch, file):
     for name in run_folder.FILES:
         (folder / "out" / name).write_bytes(b"old")
     for module in (placement, files):
-        monkeypatch.setattr(module, "finish", full)
+        monkeypatch.setattr(module, "flush_to_disk", full)
     made = run_folder.FILES[: run_folder.FILES.index(file)]
     written = f"; written: {', '.join(os.path.join('out', name) for name in made)}" if made else "; no other folder"
     reason = f"{os.path.join('out', file)}: cannot be written: No space left on device{written}"

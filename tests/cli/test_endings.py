@@ -388,12 +388,12 @@ def test_an_interrupt_that_is_ignored_stays_so():
 def test_an_interrupt_is_raised_where_the_command_has_something_to_keep():
     before = signal.signal(signal.SIGINT, interrupts.end)
     try:
-        with interrupts.raised():
+        with interrupts.raising_interrupts():
             assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         assert signal.getsignal(signal.SIGINT) is interrupts.end
     finally:
         signal.signal(signal.SIGINT, before)
-    with interrupts.raised():  # in somebody's own program
+    with interrupts.raising_interrupts():  # in somebody's own program
         assert signal.getsignal(signal.SIGINT) is before
 
 
@@ -405,7 +405,7 @@ def test_the_commands_that_have_something_to_keep(quick, monkeypatch, words):
 
     monkeypatch.setattr(hjbjax, "solve", interrupt)
     monkeypatch.setattr(gallery, "card", interrupt)
-    monkeypatch.setattr("hjbjax.cli.launch.start", interrupt)
+    monkeypatch.setattr("hjbjax.cli.launch.start_processes", interrupt)
     before = signal.signal(signal.SIGINT, interrupts.end)
     try:
         result = run(*words.split())

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 import hjbjax as hjb
 from hjbjax.cli import children, launch, run_folder
-from hjbjax.cli.children import End, Outcome
+from hjbjax.cli.children import ChildEnds, End
 from hjbjax.cli.command_line import Failure
 from hjbjax.cli.main import main
 from hjbjax.solution.solution import Solution, Status
@@ -107,7 +107,7 @@ def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):
     (tmp_path / "pendulum").mkdir()
     (tmp_path / "pendulum" / "value.png").touch()
     (tmp_path / "run.npz").touch()
-    monkeypatch.setattr(children, "run", lambda *_, **__: Outcome((End(0, 0), End(1, 0))))
+    monkeypatch.setattr(children, "run", lambda *_, **__: ChildEnds((End(0, 0), End(1, 0))))
     for more in (("--force", "--checkpoint", "run", "--resume"), ("--dry-run",)):
         assert CliRunner().invoke(main, ["launch", "--", "solve", "pendulum", *more]).exit_code == 0
 
@@ -241,7 +241,7 @@ WAY_ON = "go on"
 
 def outcome_of(*codes, words="", **more):
     """An outcome with the exit codes of processes in the order in which they ended."""
-    return Outcome(tuple(End(number, code, words) for number, code in codes), **more)
+    return ChildEnds(tuple(End(number, code, words) for number, code in codes), **more)
 
 
 @pytest.mark.parametrize(
@@ -283,7 +283,7 @@ def test_the_first_process_has_said_it(outcome, code):
             "process 1 of 2 did not start within 122 s; go on",
         ),
         (
-            Outcome((End(1, 0, early=True), End(0, -6))),
+            ChildEnds((End(1, 0, early=True), End(0, -6))),
             7,
             "process 1 of 2 ended with exit code 0 before the others were done; go on",
         ),

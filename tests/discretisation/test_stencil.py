@@ -53,7 +53,7 @@ def test_edges_and_differences(grid):
     values = np.random.default_rng(1).normal(size=grid.shape)
     for axis in range(grid.ndim):
         h = grid.spacing(axis)
-        link = stencil.links(grid, axis)
+        link = stencil.grid_links(grid, axis)
         assert (link.up, link.down, link.meets_up, link.meets_down) == (h, h, None, None)
         up, down = map(np.asarray, stencil.one_sided(jnp.asarray(values), grid, axis))
         for index in np.ndindex(*grid.shape):

@@ -58,7 +58,7 @@ def found(problem, value, dtype=np.float64):
     on = cast(Discretisation(problem, GRID, hjb.Upwind(), dtype), dtype)
     hamiltonian = discrete.around(on, jnp.asarray(value, dtype))
     best, u, _ = optimum.optimise(hamiltonian)
-    missed = exact.missed(hamiltonian, players_of(hamiltonian.on).control, lambda u: (u, []))
+    missed = exact.optimum_error(hamiltonian, players_of(hamiltonian.on).control, lambda u: (u, []))
     return best, jnp.stack([jnp.broadcast_to(each, SHAPE) for each in u], -1), missed
 
 

@@ -44,11 +44,11 @@ def square(n):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_estimate_is_proportional_to_nodes_and_word(method):
-    one = memory.estimate(PROBLEM, square(10), method, np.float64)
+    one = memory.peak_bytes(PROBLEM, square(10), method, np.float64)
     assert isinstance(one, int)
-    assert memory.estimate(PROBLEM, square(20), method, np.float64) == 4 * one
-    assert one / 2 <= memory.estimate(PROBLEM, square(10), method, np.float32) < one
-    assert memory.estimate(PROBLEM, square(100_000_000), method, np.float64) == 10**14 * one  # Python integers
+    assert memory.peak_bytes(PROBLEM, square(20), method, np.float64) == 4 * one
+    assert one / 2 <= memory.peak_bytes(PROBLEM, square(10), method, np.float32) < one
+    assert memory.peak_bytes(PROBLEM, square(100_000_000), method, np.float64) == 10**14 * one  # Python integers
 
 
 def told_over_needed(problem, grid, method):
@@ -61,7 +61,7 @@ def told_over_needed(problem, grid, method):
         state = jax.eval_shape(fixed_point.begin, task, jax.ShapeDtypeStruct(grid.shape, np.float64))
         found = stationary_run.run.lower(task, state, 1).compile().memory_analysis()
     together = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
-    return memory.estimate(problem, grid, method, np.float64) / (together - found.alias_size_in_bytes)
+    return memory.peak_bytes(problem, grid, method, np.float64) / (together - found.alias_size_in_bytes)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -82,7 +82,7 @@ def test_a_search_between_samples_is_counted(method):
 
 
 def test_policies_and_evaluations_take_memory():
-    value, sweeps, krylov = (memory.estimate(PROBLEM, square(10), method, np.float64) for method in METHODS)
+    value, sweeps, krylov = (memory.peak_bytes(PROBLEM, square(10), method, np.float64) for method in METHODS)
     assert max(value, sweeps) < krylov
     game = hjb.Problem(
         lambda x, u, d: drift(x, u) + d,
@@ -91,7 +91,7 @@ def test_policies_and_evaluations_take_memory():
         disturbances=hjb.Box([-1.0, -1.0], [1.0, 1.0]),
         discount=1.0,
     )
-    assert memory.estimate(game, square(10), METHODS[0], np.float64) > value
+    assert memory.peak_bytes(game, square(10), METHODS[0], np.float64) > value
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -221,7 +221,7 @@ def test_six_dimensions_are_refused_with_a_way_out():
 
 def test_nobody_says_what_is_free(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: None)
-    needed = memory.estimate(PROBLEM, square(30_000), METHODS[0], np.float64)
+    needed = memory.peak_bytes(PROBLEM, square(30_000), METHODS[0], np.float64)
     assert memory.require(PROBLEM, square(30_000), METHODS[0], np.float64, None) == needed
 
 
@@ -240,6 +240,6 @@ def test_the_estimate_is_near_what_the_compiler_reports(method):
         state = jax.eval_shape(fixed_point.begin, task, jnp.zeros(grid.shape))
         analysis = jax.jit(fixed_point.run).lower(task, state, 1).compile().memory_analysis()
     peak = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes
-    estimate = memory.estimate(PROBLEM, grid, method, np.float64)
+    estimate = memory.peak_bytes(PROBLEM, grid, method, np.float64)
     assert peak / 4 <= estimate <= 4 * peak
     assert estimate >= peak / 2

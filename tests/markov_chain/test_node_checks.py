@@ -80,7 +80,7 @@ def test_another_parameter_value_does_not_trace_again():
 
     counts = []
     for rate in (1.0, 2.0, 3.0):
-        node_checks.values(Discretisation(Problem(Counted(rate).drift, controls=U), GRID, Upwind(), "float64"))
+        node_checks.check_values(Discretisation(Problem(Counted(rate).drift, controls=U), GRID, Upwind(), "float64"))
         counts.append(count)
     assert counts[0] > 0
     assert len(set(counts)) == 1

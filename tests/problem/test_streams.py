@@ -55,7 +55,7 @@ def test_a_warning_that_cannot_be_written_is_dropped():
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = show_as_python_does
-        streams.warn("said to nobody")
+        streams.warn_safely("said to nobody")
 
 
 def test_a_warning_in_letters_that_the_stream_lacks_is_dropped(monkeypatch):
@@ -63,18 +63,18 @@ def test_a_warning_in_letters_that_the_stream_lacks_is_dropped(monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = show_as_python_does
-        streams.warn("γ is too small")
+        streams.warn_safely("γ is too small")
 
 
 @pytest.mark.usefixtures("broken")
 def test_a_warning_that_is_made_an_error_is_raised():
     with pytest.raises(UserWarning, match="said"):
-        streams.warn("said")
+        streams.warn_safely("said")
 
 
 def test_the_line_of_a_warning_is_that_of_the_caller():
     with pytest.warns(RuntimeWarning, match="said") as found:
-        streams.warn("said", RuntimeWarning)
+        streams.warn_safely("said", RuntimeWarning)
     assert found[0].filename == __file__
 
 
@@ -86,4 +86,4 @@ def test_an_exception_of_the_program_s_own_way_to_show_warnings_is_raised(monkey
         warnings.simplefilter("always")
         warnings.showwarning = show
         with pytest.raises(ValueError, match="mine"):
-            streams.warn("said")
+            streams.warn_safely("said")

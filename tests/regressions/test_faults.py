@@ -55,10 +55,10 @@ def broken(caught, words="my own trouble"):
 
 
 def test_what_calls_python_is_known(trouble):
-    assert checks.calls_back(trouble.problem, 1)
-    assert not checks.calls_back(hjb.Problem(lambda x, u: u, cost, U), 1)
+    assert checks.problem_calls_back(trouble.problem, 1)
+    assert not checks.problem_calls_back(hjb.Problem(lambda x, u: u, cost, U), 1)
     within = hjb.Problem(lambda x, u: u, lambda x, u: jax.jit(lambda x: trouble.drift(x, u))(x)[0], U)
-    assert checks.calls_back(within, 1)
+    assert checks.problem_calls_back(within, 1)
 
 
 @pytest.mark.filterwarnings("ignore:the primitive 'pure_callback'")

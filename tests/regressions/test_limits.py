@@ -736,8 +736,8 @@ def test_an_extremal_interrupted_on_the_way_to_a_first_guess(monkeypatch):
 
 
 def test_ctrl_c_while_an_extremal_is_checked_is_not_lost(monkeypatch):
-    assemble = continuation.assemble
-    monkeypatch.setattr(continuation, "assemble", lambda *a: (signal.raise_signal(signal.SIGINT), assemble(*a))[1])
+    made = continuation.assemble_extremal
+    monkeypatch.setattr(continuation, "assemble_extremal", lambda *a: (signal.raise_signal(signal.SIGINT), made(*a))[1])
     extremal = hjb.pontryagin(LQ, [1.0], throw=False)
     assert extremal.status is INTERRUPTED
     assert extremal.cost == pytest.approx(1.0, rel=1e-6)

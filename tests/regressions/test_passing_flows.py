@@ -184,7 +184,7 @@ def test_the_message_tells_never_from_perhaps():
 @pytest.mark.slow
 def test_arcs_that_do_not_fit_leave_the_chain(monkeypatch):
     """The answer is then that of the chain, with its warning."""
-    monkeypatch.setattr(semi_lagrangian, "estimate", lambda *_: 10**15)
+    monkeypatch.setattr(semi_lagrangian, "arc_bytes", lambda *_: 10**15)
     with pytest.warns(hjb.SolveWarning, match="carried past the target"):
         solution = hjb.solve(drifting(), square(21))
     assert "SemiLagrangian" not in solution.message

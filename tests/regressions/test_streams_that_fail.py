@@ -62,7 +62,7 @@ def test_a_front_door_without_a_usable_standard_error(door, monkeypatch):
 def test_a_bar_on_a_stream_that_fails_is_not_shown(kind, progress, monkeypatch):
     monkeypatch.setattr(sys, "stderr", BROKEN[kind]())
     clock = Clock(progress=progress)
-    with host_loop.telling(clock), host_loop.progress_bar(progress, {"total": 3, "delay": 0}) as bar:
+    with host_loop.announce(clock), host_loop.progress_bar(progress, {"total": 3, "delay": 0}) as bar:
         clock.phase = "compiling for 9 nodes"
         if bar is not None:
             bar.update(2)

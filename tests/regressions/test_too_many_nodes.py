@@ -94,7 +94,7 @@ def test_a_dry_run_of_such_a_grid_ends_with_six(tmp_path, monkeypatch):
 def test_what_does_not_fit_is_refused_before_the_nodes_are_looked_at(scheme, monkeypatch):
     from hjbjax.markov_chain import node_checks
 
-    monkeypatch.setattr(node_checks, "values", None)
+    monkeypatch.setattr(node_checks, "check_values", None)
     grid = hjb.Grid([-1.0] * 2, [1.0] * 2, (40_000, 40_001))
     with pytest.raises(MemoryError, match=r"40000 x 40001 = 1,600,040,000 nodes need about .* GB are free"):
         hjb.solve(posed(), grid, scheme=scheme, max_memory=10**9)

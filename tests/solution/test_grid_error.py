@@ -26,26 +26,26 @@ def answers(error, order, gain=None, exact=SMOOTH, **options):
 @pytest.mark.parametrize(("order", "gain"), [(2, None), (2, 1.0), (1, 0.01)])
 def test_the_order_is_measured_by_what_the_slopes_gain(order, gain):
     error = H**order * (1 + X[..., 0] ** 2) / 10
-    found = grid_error.estimate(answers(error, order, gain))
+    found = grid_error.estimate_error(answers(error, order, gain))
     np.testing.assert_allclose(found[::2, ::2], error[::2, ::2], rtol=0.02)
 
 
 def test_between_the_orders_the_estimate_is_between():
     error = H * (1 + X[..., 0] ** 2) / 10
     change = error[::2, ::2]
-    found = grid_error.estimate(answers(error, 1, 5 * error))[::2, ::2]  # a fifth of what the slopes gained
+    found = grid_error.estimate_error(answers(error, 1, 5 * error))[::2, ::2]  # a fifth of what the slopes gained
     assert np.all((found > change / 3) & (found < change))
 
 
 def test_where_both_schemes_are_one_the_order_is_that_of_central_differences():
     error = H**2 * (1 + X[..., 0] ** 2) / 10
-    found = grid_error.estimate(answers(error, 2, 1e-6 * error))
+    found = grid_error.estimate_error(answers(error, 2, 1e-6 * error))
     np.testing.assert_allclose(found[::2, ::2], error[::2, ::2], rtol=0.02)
 
 
 def test_next_to_a_kink_the_order_is_one():
     bent = np.abs(X[..., 0] - 0.01) + 0.2 * X[..., 1] ** 2
-    found = grid_error.estimate(answers(np.full((41, 41), 1e-3), 1, exact=bent))
+    found = grid_error.estimate_error(answers(np.full((41, 41), 1e-3), 1, exact=bent))
     far = np.abs(X[..., 0]) > 6 * H
     np.testing.assert_allclose(found[20], 1e-3, rtol=0.25)  # the kink is not at a node
     np.testing.assert_allclose(found[far], 1e-3 / 3, rtol=0.05)
@@ -61,21 +61,21 @@ def test_a_jump_is_off_by_its_height(smeared):
     line = np.linspace(-1, 1, 41) - 0.01
     value = np.broadcast_to(5 * step(line, H)[:, None], (41, 41)) + 0.1 * SMOOTH
     before = np.broadcast_to(5 * step(line[::2], 2 * H)[:, None], (21, 21)) + 0.1 * SMOOTH[::2, ::2]
-    found = grid_error.estimate(TwoGrids(FINE, COARSE, value, before, NONE_HELD))
+    found = grid_error.estimate_error(TwoGrids(FINE, COARSE, value, before, NONE_HELD))
     assert np.min(found[20]) > 10 / 3
     assert np.max(found[np.abs(X[..., 0]) > 10 * H]) < 0.01
 
 
 def test_a_steep_value_is_not_a_jump():
     for steep in (np.exp(4 * X[..., 0]), 30 * np.abs(X[..., 0] - 0.01), np.hypot(X[..., 0], X[..., 1])):
-        found = grid_error.estimate(TwoGrids(FINE, COARSE, steep, steep[::2, ::2], NONE_HELD))
+        found = grid_error.estimate_error(TwoGrids(FINE, COARSE, steep, steep[::2, ::2], NONE_HELD))
         assert np.max(found) < 1e-12
 
 
 def test_v_may_jump_to_a_prescribed_value():
     held = np.hypot(X[..., 0], X[..., 1]) < 0.3
     value = np.where(held, 5.0, SMOOTH)
-    found = grid_error.estimate(TwoGrids(FINE, COARSE, value, value[::2, ::2], held))
+    found = grid_error.estimate_error(TwoGrids(FINE, COARSE, value, value[::2, ::2], held))
     assert np.max(found) < 1e-12
 
 
@@ -84,7 +84,7 @@ def test_infinite_values_have_no_error_and_spoil_none():
     error = np.full((41, 41), H**2 / 10)
     finite = answers(error, 2)
     value, before = np.where(lost, np.inf, finite.value), np.where(lost[::2, ::2], np.inf, finite.before)
-    found = grid_error.estimate(TwoGrids(FINE, COARSE, value, before, NONE_HELD))
+    found = grid_error.estimate_error(TwoGrids(FINE, COARSE, value, before, NONE_HELD))
     assert np.all(found[lost] == 0)
     np.testing.assert_allclose(found[X[..., 1] < 0.4], error[0, 0], rtol=1e-6)
 
@@ -93,13 +93,13 @@ def test_a_chain_of_two_states_is_exact_and_angles_go_round():
     fine = Grid([0.0, 0.0], [2 * np.pi, 1.0], (40, 2), periodic=(True, False))
     coarse = Grid([0.0, 0.0], [2 * np.pi, 1.0], (20, 2), periodic=(True, False))
     wave = np.sin(np.arange(40) * np.pi / 20)[:, None] + np.array([0.0, 3.0])
-    found = grid_error.estimate(TwoGrids(fine, coarse, wave, (wave + 3e-3)[::2], np.zeros((40, 2), bool)))
+    found = grid_error.estimate_error(TwoGrids(fine, coarse, wave, (wave + 3e-3)[::2], np.zeros((40, 2), bool)))
     np.testing.assert_allclose(found, 1e-3, rtol=0.02)
 
 
 def test_the_order_is_at_most_that_of_the_scheme():
     error = np.full((41, 41), 1e-3)
-    found = grid_error.estimate(answers(error, 0.5, highest=grid_error.LEAST))
+    found = grid_error.estimate_error(answers(error, 0.5, highest=grid_error.LEAST))
     np.testing.assert_allclose(found, error, rtol=1e-6)
 
 

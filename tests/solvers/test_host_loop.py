@@ -326,7 +326,7 @@ def test_a_terminal_that_tells_no_width_is_told_the_phases(monkeypatch):
     with open(writer, "w", buffering=1) as terminal:
         monkeypatch.setattr("sys.stderr", terminal)
         clock = Clock()
-        with host_loop.telling(clock):
+        with host_loop.announce(clock):
             clock.phase = "compiling for 81 nodes"
         seen = ""
         # a terminal passes on what is written when it comes to it, in parts

@@ -175,8 +175,8 @@ def test_a_solve_takes_twelve_bytes_a_node_beyond_the_value(n, count, problem):
         taken = peak(stationary_run.run.lower(task, state, 1)) / grid.size
     assert taken <= 4 + (8 if n > 4 else 12) + 0.2
     # and where it began, which is kept until the end
-    assert memory.estimate(problem, grid, BARE, kind) / grid.size == pytest.approx(taken + 4, rel=0.1)
-    assert memory.estimate(problem, grid, hjb.ValueIteration(), kind) > memory.estimate(problem, grid, BARE, kind)
+    assert memory.peak_bytes(problem, grid, BARE, kind) / grid.size == pytest.approx(taken + 4, rel=0.1)
+    assert memory.peak_bytes(problem, grid, hjb.ValueIteration(), kind) > memory.peak_bytes(problem, grid, BARE, kind)
 
 
 @pytest.mark.parametrize(("n", "count"), [(2, 400), pytest.param(5, 8, marks=pytest.mark.slow)])

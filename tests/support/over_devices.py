@@ -159,7 +159,7 @@ def read_of_others(grid, value, mask):
     """All that is read of other nodes, by names, and all that is found of the nodes together."""
     moves = [stencil.unit(grid, axis, step) for axis in range(grid.ndim) for step in (1, -1)]
     moves += [tuple(1 if axis else -1 for axis in range(grid.ndim))]
-    links = [stencil.links(grid, axis) for axis in range(grid.ndim)]
+    links = [stencil.grid_links(grid, axis) for axis in range(grid.ndim)]
     sides = [stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links)]
     both, even = enumerate(zip(sides, links, strict=True)), not any(grid.stretch)
     read = {

@@ -28,7 +28,7 @@ def refused(ask, match, grid=GRID, cause=None, **ingredients):
         checks.shapes(problem, grid, Upwind())
     asked = {
         "shapes": lambda: checks.shapes(problem, grid, Upwind()),
-        "values": lambda: node_checks.values(Discretisation(problem, grid, Upwind(), "float64")),
+        "values": lambda: node_checks.check_values(Discretisation(problem, grid, Upwind(), "float64")),
     }
     with pytest.raises(ValueError, match=match) as caught:
         asked[ask]()
@@ -41,4 +41,4 @@ def refused(ask, match, grid=GRID, cause=None, **ingredients):
 def accepted(grid=GRID, dtype="float64", **ingredients):
     problem = Problem(**({"drift": drift, "controls": U} | ingredients))
     checks.shapes(problem, grid, Upwind())
-    node_checks.values(Discretisation(problem, grid, Upwind(), dtype))
+    node_checks.check_values(Discretisation(problem, grid, Upwind(), dtype))

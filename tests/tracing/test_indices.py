@@ -62,7 +62,7 @@ def test_beyond(name):
 @pytest.mark.parametrize("name", WITHIN)
 def test_within(name):
     with jax.enable_x64(True):
-        assert indices.beyond(jax.make_jaxpr(WITHIN[name])(X), ("x",)) is None
+        assert indices.first_outside(jax.make_jaxpr(WITHIN[name])(X), ("x",)) is None
 
 
 @pytest.mark.parametrize("name", ["cost", "target", "stopping_cost", "running_max", "noise"])

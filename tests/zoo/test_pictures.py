@@ -8,7 +8,7 @@ from pictures import pictures as plotting
 
 from hjbjax import Grid, Problem, Solution, Status, simulate, zoo
 from hjbjax.cli import run_folder
-from hjbjax.feedback.path import PathStatus, joined
+from hjbjax.feedback.path import PathStatus, join_paths
 
 
 def exact_solution(entry, **parameters):
@@ -101,7 +101,7 @@ def test_a_constant_control_is_drawn_level_and_not_as_its_rounding():
 def test_joined_paths_discount_what_comes_later():
     problem = Problem(lambda x, u: 0 * x + 1, lambda x, u: 1.0, discount=0.5)
     first, then = (simulate(problem, None, [x0], 2.0, steps=4) for x0 in (0.0, 2.0))
-    whole = joined(first, then, 0.5)
+    whole = join_paths(first, then, 0.5)
     assert whole.cost == pytest.approx(simulate(problem, None, [0.0], 4.0, steps=8).cost, abs=1e-7)
     np.testing.assert_allclose(whole.times, np.linspace(0, 4, 9))
     np.testing.assert_allclose(whole.states[:, 0], whole.times, atol=1e-9)

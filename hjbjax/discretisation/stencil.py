@@ -244,8 +244,7 @@ class Links:
     Attributes:
       up, down: the distances.
       meets_up, meets_down: the nodes where the link ends on the boundary of a target before the next node, and the
-      value
-        there; None if no link does.
+        value there; None if no link does.
     """
 
     up: PerNode

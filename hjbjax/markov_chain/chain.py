@@ -111,8 +111,8 @@ def stationary_density(
 
     Raises:
       ValueError: the problem has a target, where paths end; there are several recurrent classes, or one that is
-      connected only by rates of the size of rounding, so that the distribution depends on the start; or ``generator``
-      raises.
+        connected only by rates of the size of rounding, so that the distribution depends on the start; or ``generator``
+        raises.
 
     Example:
       >>> import numpy as np
@@ -167,8 +167,7 @@ def transition_arrays(
 
     Raises:
       ValueError: the problem is not such a decision problem, rates or costs are not finite, or the chain cannot
-        represent
-      the noise.
+        represent the noise.
     """
     grid.check_indices()
     actions = decision_process.action_table(problem)

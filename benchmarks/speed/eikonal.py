@@ -22,7 +22,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table, without
-from benchmarks.harness.timing import Timing, interleaved
+from benchmarks.harness.timing import interleaved
 
 COLUMNS = (
     "dim", "solver", "shape", "nodes", "seconds", "cpu_seconds", "compile_seconds", "error", "mean_error",
@@ -53,13 +53,11 @@ def question(dim: int, count: int) -> tuple[hjb.Problem, hjb.Grid]:
     return problem, hjb.Grid([-1.0] * dim, [1.0] * dim, (count,) * dim)
 
 
-def candidates(dim: int, count: int) -> dict[str, Callable[[], np.ndarray]]:
-    """Our values and the peer's, by name."""
+def candidates(problem: hjb.Problem, grid: hjb.Grid, radius: np.ndarray) -> dict[str, Callable[[], np.ndarray]]:
+    """Our values and the peer's, by name; ``radius`` is |x| at the nodes."""
     import skfmm
 
-    problem, grid = question(dim, count)
-    radius = np.linalg.norm(grid.nodes(), axis=-1)
-    distance, speed, spacing = radius - RADIUS, 1 / (1 + radius**2), 2 / (count - 1)
+    distance, speed, spacing = radius - RADIUS, 1 / (1 + radius**2), float(grid.spacing(0))
 
     def ours(options: dict[str, Any]) -> np.ndarray:
         with warnings.catch_warnings():
@@ -74,20 +72,19 @@ def candidates(dim: int, count: int) -> dict[str, Callable[[], np.ndarray]]:
 
 def rows_of(dim: int, count: int, repeats: int) -> list[dict[str, Any]]:
     """The rows of one grid."""
-    found, timings = interleaved(candidates(dim, count), repeats)
-    radius = np.linalg.norm(question(dim, count)[1].nodes(), axis=-1)
+    problem, grid = question(dim, count)
+    radius = np.linalg.norm(grid.nodes(), axis=-1)
+    found, timings = interleaved(candidates(problem, grid, radius), repeats)
     outside = radius > RADIUS
     rows = []
     for name, value in found.items():
         errors = np.abs(value - exact(radius))[outside]
         row = {"solver": name, "shape": list(radius.shape), "nodes": radius.size, "status": "DONE"}
         row |= {"error": float(np.max(errors)), "mean_error": float(np.mean(errors))}
-        rows.append(row | timings[name].row | _ratio(timings, name))
+        if name in OURS:
+            row["at_equal_nodes"] = timings[PEER].over(timings[name])
+        rows.append(row | timings[name].row)
     return rows
-
-
-def _ratio(timings: dict[str, Timing], name: str) -> dict[str, float]:
-    return {} if name == PEER else {"at_equal_nodes": timings[PEER].over(timings[name])}
 
 
 def seconds_for(error: float, peers: Sequence[dict[str, Any]]) -> tuple[float, bool]:

@@ -192,7 +192,9 @@ def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True
         raise ValueError(f"{name}: got the modes {modes}, wanted 'min' or 'max'")
     controls = _admissible(dynamics.control_space, f"{name}: control_space")
     others = _admissible(dynamics.disturbance_space, f"{name}: disturbance_space")
-    m, fixed = controls.dim, others.lo if isinstance(others, Box) and bool(np.all(others.lo == others.hi)) else None
+    m, fixed = controls.dim, None
+    if isinstance(others, Box) and np.all(others.lo == others.hi):
+        fixed = others.lo
     helping = modes[0] == modes[1] and fixed is None
     if helping and not (isinstance(controls, Box) and isinstance(others, Box)):
         raise ValueError(

@@ -137,9 +137,14 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN else text[: SHOWN - 4] + " ..."
 
 
+def _is_left_out(entries: object) -> bool:
+    """True for the defaults of entries per axis: () and None. An array is compared with neither."""
+    return entries is None or (isinstance(entries, tuple) and not entries)
+
+
 def stretchings(stretch: Any, n: int) -> tuple[Stretching | None, ...]:
     """The stretching of each of the n axes; None and () mean that no axis is stretched."""
-    if stretch is None or (isinstance(stretch, tuple) and not stretch):
+    if _is_left_out(stretch):
         return (None,) * n
     if isinstance(stretch, str) or not isinstance(stretch, Iterable):
         raise TypeError(f"Grid.stretch: got {stretch!r}, wanted one entry per axis, as in (hjb.Sinh(3.0), None)")
@@ -232,7 +237,7 @@ def counts(shape: object) -> tuple[int, ...]:
 
 def periodic_flags(periodic: object, n: int) -> tuple[bool, ...]:
     """One flag for each of the n axes, True if it is periodic; None and () mean that no axis is."""
-    if periodic is None or (isinstance(periodic, tuple) and not periodic):
+    if _is_left_out(periodic):
         return (False,) * n
     wanted = f"wanted one bool per axis (not axis numbers), as in {(True,) + (False,) * (n - 1)}"
     if isinstance(periodic, (str, bool)) or not isinstance(periodic, (Sequence, np.ndarray)):

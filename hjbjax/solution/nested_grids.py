@@ -33,7 +33,7 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
     return with_faces_of(grid, dataclasses.replace(grid, shape=tuple(shape)))
 
 
-def coarser_grid(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
+def comparison_grid(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
     """The coarser grid for the estimate of the error of ``grid``; None if an axis has too few intervals.
 
     It has about half the intervals per axis. Every fixed node, or a fixed neighbour of it, must lie in a coarse cell

@@ -66,7 +66,7 @@ def levels(task: Task, method: Method, clock: Clock, *, asked_again: bool) -> li
     With ``asked_again`` the next coarser grid is there in any case, if it can estimate the error of the grid.
     """
     found: list[Task] = []
-    smaller = (coarser_grid_of(task) if asked_again else None) or below(task.grid, method)
+    smaller = (comparison_grid_of(task) if asked_again else None) or below(task.grid, method)
     while smaller is not None and clock.over() is None:
         clock.phase = f"the preparation of {' x '.join(map(str, smaller.shape))} nodes"
         level = on_coarser(task, smaller)
@@ -83,11 +83,11 @@ def below(grid: Grid, method: Method) -> Grid | None:
     return None if smaller is None or method.coarsest is None or smaller.size < method.coarsest else smaller
 
 
-def coarser_grid_of(task: Task) -> Grid | None:
+def comparison_grid_of(task: Task) -> Grid | None:
     """The coarser grid for the estimate of the error of the task's grid; None if there is none."""
-    # only for nodes of the finer grid it is known which of them cannot reach the target
+    # which nodes cannot reach the target is known only for nodes of the finer grid
     fixed = np.broadcast_to(np.asarray(task.obstacles.fixed), task.grid.shape)
-    return nested_grids.coarser_grid(task.grid, fixed, nested=task.has_lost)
+    return nested_grids.comparison_grid(task.grid, fixed, nested=task.has_lost)
 
 
 def on_coarser(task: Task, coarse: Grid) -> Task | None:
@@ -103,7 +103,7 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
         known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
         on = task.on.on_grid(coarse)
         made = dataclasses.replace(known, on=_kept(on) if cut_cells.keeps(on) else on)
-    elif task.has_lost:  # it is unknown if the nodes in between reach the target
+    elif task.has_lost:  # whether nodes in between reach the target is not known
         return None
     else:
         level = task.on.chain.on_grid(coarse)

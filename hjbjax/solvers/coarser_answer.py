@@ -8,7 +8,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import Status
-from hjbjax.solvers.coarse_levels import coarser_grid_of, fill_unreachable, on_coarser
+from hjbjax.solvers.coarse_levels import comparison_grid_of, fill_unreachable, on_coarser
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.stationary_run import iterate
 
@@ -29,9 +29,9 @@ class CoarserAnswer(NamedTuple):
 def coarser_answer(settled: Settled, clock: Clock) -> CoarserAnswer:
     """The solution on the next coarser grid, by the scheme of ``settled`` and started from its value."""
     task, fine = settled.running, settled.task.grid
-    coarse = coarser_grid_of(task)
+    coarse = comparison_grid_of(task)
     if coarse is None:
-        few = nested_grids.coarser_grid(fine, np.zeros(fine.shape, bool)) is None
+        few = nested_grids.comparison_grid(fine, np.zeros(fine.shape, bool)) is None
         return CoarserAnswer(None, reason=TOO_FEW if few else LOSES)
     if clock.over() is not None:
         return CoarserAnswer(None, reason=OVER)

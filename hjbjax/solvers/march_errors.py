@@ -162,9 +162,9 @@ def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
     """The coarser grid for the repeated march."""
     task, everything = marched.task, np.arange(len(times))
     grid, others = task.grid, box_error.other_ends(task.problem, task.grid)
-    coarse = nested_grids.coarser_grid(grid, np.any(held, axis=0))
+    coarse = nested_grids.comparison_grid(grid, np.any(held, axis=0))
     if coarse is None:
-        reason = TOO_FEW if nested_grids.coarser_grid(grid, np.zeros(grid.shape, bool)) is None else LOSES
+        reason = TOO_FEW if nested_grids.comparison_grid(grid, np.zeros(grid.shape, bool)) is None else LOSES
     elif min(coarse.shape) < task.on.scheme.points and not task.on.scheme.monotone:
         reason = TOO_FEW
     elif marched.steps <= 1 and not task.method.limited:

@@ -1,8 +1,7 @@
 """The start of an undiscounted solve: the solutions for vanishing discounts.
 
-Near zero, an undiscounted problem is full of policies that stay where they are, at a cost. With a small discount
-policies move to the target. A stopping cost or a running maximum is a start itself: ψ is above all fixed points, g
-below.
+If an undiscounted problem is iterated from zero, its policies stay where they are, at a cost. With a small discount
+they move to the target. A stopping cost or a running maximum is a start itself: ψ is above all fixed points, g below.
 """
 
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ WARM_STEPS = 60  # largest number of improvements per discount, as the last valu
 
 
 def warm(task: Task, guess: Nodes | None, clock: Clock) -> Nodes:
-    """The guess, or without one zero, or without discount a start that leads to the right one of many fixed points."""
+    """The guess if there is one; else zero, or without discount a start that leads to the right fixed point."""
     if guess is not None:
         return guess
     value = task.start() if task.constrained else jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))
@@ -34,7 +33,10 @@ def needs_a_way(task: Task) -> bool:
 
 
 def follow(task: Task, value: Nodes, discounts: tuple[float, ...], clock: Clock) -> Nodes:
-    """The solution for the last of these discounts, over the crossing time, each started from the one before."""
+    """The solution for the last of these discounts, in units of one over the crossing time.
+
+    The iteration for each discount starts from the solution for the one before.
+    """
     for discount in discounts:
         value = iterate(under(task, discount), value, clock, most=WARM_STEPS)[0].value
     return value

@@ -326,7 +326,7 @@ def test_without_cost_and_discount_constraints_supply_the_value(seed):
 
 @pytest.mark.parametrize(("turned", "shares"), [(True, [0.5, 0.25, 0.125]), (False, [1.0])])
 def test_corrections_that_do_not_shrink_are_halved_where_they_turn_back(turned, shares):
-    """Every six steps of one size, three times at most; what goes on in one direction is taken whole."""
+    """Once per six equal steps and at most three times; steps that continue in one direction are taken whole."""
     moves = certificates.Moves(jnp.full(2, jnp.inf), jnp.inf, jnp.ones(()), jnp.zeros((), int))
     found = []
     for step in range(30):

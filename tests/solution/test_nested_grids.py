@@ -61,21 +61,21 @@ def test_the_grid_that_tells_the_error_keeps_the_held_node(shape, nested, wanted
     grid, held = hjb.Grid([-1.0, -1.0], [1.0, 1.0], shape), np.zeros(shape, bool)
     if all(count % 2 for count in shape):
         held[shape[0] // 2, shape[1] // 2] = True
-    coarse = nested_grids.coarser_grid(grid, held, nested=nested)
+    coarse = nested_grids.comparison_grid(grid, held, nested=nested)
     assert (None if coarse is None else coarse.shape) == wanted
 
 
 def test_a_second_target_is_not_lost_either():
     grid, held = hjb.Grid([0.0], [1.0], (41,)), np.zeros(41, bool)
     held[[0, 13, 40]] = True
-    coarse = nested_grids.coarser_grid(grid, held)
+    coarse = nested_grids.comparison_grid(grid, held)
     assert coarse is None or np.min(np.abs(np.asarray(coarse.axis(0)) - 13 / 40)) < 1e-9
     held[13:20] = True  # a wide one is on any grid
-    assert nested_grids.coarser_grid(grid, held).shape == (21,)
+    assert nested_grids.comparison_grid(grid, held).shape == (21,)
 
 
 def test_the_tip_of_a_disc_is_kept_with_the_disc():
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (41, 41))
     x = np.asarray(grid.nodes()).reshape(41, 41, 2)
     disc = np.hypot(x[..., 0] - 0.4, x[..., 1] + 0.55) < 0.2 + 1e-9  # its tips lie between coarse nodes
-    assert nested_grids.coarser_grid(grid, disc).shape == (21, 21)
+    assert nested_grids.comparison_grid(grid, disc).shape == (21, 21)

@@ -81,7 +81,7 @@ def test_the_estimate_is_of_the_size_of_the_error(name, count, share, parameters
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [31, 41, 51])
 def test_a_slow_way_to_the_limit_is_not_halved(count):
-    """Next to the disc a few nodes go on by equal steps: halved, they took 135 steps on 41 nodes along each axis."""
+    """A few nodes next to the disc move by equal steps. When these were halved, 41 nodes per axis took 135 steps."""
     problem, grid = zoo.dubins(shape=(count, count, count - 1))
     assert hjb.solve(problem, grid).steps <= 40
 

@@ -49,11 +49,19 @@ def marked(mark):
                 yield int(folder.name)
 
 
+def states(pid):
+    """The states of the threads of a process; none if it has ended."""
+    found = set()
+    for each in Path(f"/proc/{pid}/task").glob("*/stat"):
+        with contextlib.suppress(OSError):  # the thread has ended meanwhile
+            found.add(each.read_text().rpartition(")")[2].split()[0])
+    return found
+
+
 def stop(pid):
     """Stop a process with all of its threads: the system continues no other when the launcher dies."""
     os.kill(pid, signal.SIGSTOP)
-    threads = Path(f"/proc/{pid}/task")
-    until(lambda: {each.read_text().rpartition(")")[2].split()[0] for each in threads.glob("*/stat")} == {"T"})
+    until(lambda: states(pid) <= {"T", "Z", "X"})
 
 
 class Launch:
@@ -82,6 +90,19 @@ class Launch:
         self.out, self.err = out.decode().splitlines(), err.decode().splitlines()
         assert self.process.returncode == 0, err
         return json.loads(self.out.pop())
+
+    def signal(self, pid, number):
+        """Signal a process; stop it only if the system continues it when the launcher dies.
+
+        The system does not continue a child that is not yet the leader of its own group, or that stops after the death
+        of its launcher.
+        """
+        if number != signal.SIGSTOP:
+            os.kill(pid, number)
+        elif pid in (self.process.pid, os.getpgid(pid)):
+            stop(pid)
+            if self.process.poll() is not None:
+                os.kill(pid, signal.SIGCONT)
 
     def gone(self):
         """Wait until no process is left."""
@@ -387,10 +408,9 @@ def test_random_signals_at_random_times(launch, seed):
     for _ in range(rng.randint(0, 4)):
         time.sleep(rng.random() * 0.05)
         number = rng.choice([signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGSTOP, signal.SIGCONT])
-        # a child that is stopped once its launcher has gone belongs to nobody
-        if found.process.poll() is None and (there := list(marked(found.mark))):
+        if there := list(marked(found.mark)):
             with contextlib.suppress(ProcessLookupError):
-                os.kill(rng.choice(there), number)
+                found.signal(rng.choice(there), number)
     time.sleep(0.05)
     found.process.send_signal(signal.SIGCONT)
     found.process.send_signal(rng.choice([signal.SIGINT, signal.SIGKILL]))

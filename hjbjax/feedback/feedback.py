@@ -25,7 +25,7 @@ from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_jax, as_partial, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import altered, as_jax, as_partial, cast, front_door, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
@@ -35,6 +35,8 @@ from hjbjax.tracing.closures import settled
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
+# fields that no lookup reads; a solution without an estimate would compile another program than one with it
+UNREAD = ("code", "steps", "enclosure", "isaacs_gap", "reached", "grid_error", "box_error", "monotone_error", "cut")
 FEWEST = 10  # intervals between stored times that a marched feedback needs over a path
 ROUNDING = 1e-9  # relative tolerance for comparing times, which may be sums of steps
 
@@ -106,8 +108,11 @@ def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
     A state outside the target may be in a cell whose nodes are all inside, for example next to a hollow target. There
     the surrounding nodes are used.
     """
+    if isinstance(feedback, GreedyFeedback):
+        feedback = dataclasses.replace(feedback, solution=_node_values(feedback.solution))
     answers: list[GridFeedback] = [feedback]
     if isinstance(feedback, Solution):
+        answers = [feedback := _node_values(feedback)]
         players = {"policy": feedback.discrete, "disturbance": feedback.discrete_disturbance}
         given = {name: getattr(feedback, name) for name in players if getattr(feedback, name) is not None}
         # nodes without a control get their neighbours' control; this is used only where a whole cell is NaN
@@ -119,6 +124,11 @@ def lookups(feedback: GridFeedback) -> tuple[Callable, Callable]:
         for name in ("control_at", "disturbance_at")
     )
     return control, disturbance
+
+
+def _node_values(solution: Solution) -> Solution:
+    """The solution with only what a lookup reads."""
+    return altered(solution, **dict.fromkeys(UNREAD))
 
 
 # The loop clips every state into the box first; clamp=True keeps rounding from refusing a state on the boundary. An
@@ -193,11 +203,12 @@ class GreedyFeedback:
     def _ask(self, where: tuple[Place, ...], clamp: bool) -> tuple[Array, Array]:
         """Both players' actions: float64 NumPy arrays for concrete data, otherwise in the tracer's dtype."""
         costate = self.solution.costate_at(*where, clamp=clamp)  # also checks the state
-        if is_traced(costate, self):  # float64 must not be switched on in the middle of a caller's trace
+        own = dataclasses.replace(self, solution=_node_values(self.solution))
+        if is_traced(costate, own):  # float64 must not be switched on in the middle of a caller's trace
             with own_settings():
-                return _minimax(as_jax(self), where, costate)
+                return _minimax(as_jax(own), where, costate)
         with own_settings(x64=True):
-            greedy, where, costate = cast((self, where, costate), np.float64)
+            greedy, where, costate = cast((own, where, costate), np.float64)
             return jax.tree.map(np.array, _jit_minimax(greedy, where, costate))
 
 

@@ -20,7 +20,6 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 
 from hjbjax.feedback.feedback import is_grid_feedback
 from hjbjax.problem import arguments
@@ -364,8 +363,6 @@ def settled_loop(loop: Loop, n: int, own: Mapping[str, object]) -> Loop:
     """
     players = {name: getattr(loop, name) for name, given in own.items() if given is not None}
     for name, player in players.items():
-        if player is not None and player.func is timeless:
-            players[name] = Partial(timeless, closures.settled_function(player.args[0], (n,)))
-        elif player is not None and not is_grid_feedback(own[name]):
+        if player is not None and not is_grid_feedback(own[name]):
             players[name] = closures.settled_function(player, (), (n,))
     return altered(loop, problem=closures.settled(loop.problem, n), **players)

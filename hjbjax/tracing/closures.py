@@ -42,6 +42,7 @@ from hjbjax.tracing.outside import (
     fingerprint,
     identity,
     numbers_read,
+    unnested,
 )
 
 if TYPE_CHECKING:
@@ -320,9 +321,11 @@ def _with_closure_as_leaves(function: Partial, closed: jex.ClosedJaxpr) -> Parti
 
 
 def _bare(function: Partial) -> Partial:
-    """The user's function, without the ``Marked`` wrapper of an earlier public function."""
+    """The user's function, without the ``Marked`` wrappers of an earlier public function and without inner Partials."""
     inner = function.func
-    return Partial(inner.__wrapped__, *function.args, **function.keywords) if isinstance(inner, Marked) else function
+    if isinstance(inner, Marked):
+        function = Partial(inner.__wrapped__, *function.args, **function.keywords)
+    return unnested(function)
 
 
 def _trace_with_numbers_as_leaves(

@@ -62,6 +62,8 @@ def identity(thing: object, depth: int = 8) -> Hashable | None:
         return _identities(thing, depth)
     if isinstance(thing, types.FunctionType):
         return _identity_of_function(thing, depth)
+    if isinstance(thing, Nested):
+        return _identities((thing.function, *thing.inner), depth)
     if dataclasses.is_dataclass(thing) and not jax.tree_util.all_leaves([thing]):
         fields = _identities([getattr(thing, field.name) for field in dataclasses.fields(thing)], depth)
         return None if fields is None else (type(thing), fields)
@@ -205,11 +207,56 @@ def _called(callback: object) -> Hashable:
     return function
 
 
+class Nested:
+    """A function whose leading arguments hold other functions, as a function of the numbers in these arguments.
+
+    ``Partial(negative, Partial(distance, 0.5))`` is a pytree with ``distance`` in its structure, so two of them are
+    equal only for the same object ``distance``. ``Partial(Nested(negative, distance), ((0.5,), {}))`` is equal to
+    another one by what it computes, like any function, and the numbers that ``distance`` reads are found.
+
+    Args:
+      function: the outer function.
+      structure: the structure of its leading arguments and keywords, in which every inner ``Partial`` is a leaf.
+      inner: the function of each of these leaves; None for a leaf that is not a ``Partial``.
+    """
+
+    def __init__(self, function: Callable, structure: Any, inner: Sequence[Callable | None]):
+        self.function, self.structure, self.inner = function, structure, tuple(inner)
+        self.__code__ = tuple(each and code(each) for each in (function, *self.inner))
+
+    def __reduce__(self) -> tuple[type, tuple[Callable, Any, tuple[Callable | None, ...]]]:
+        """Pickle the functions, because a code object cannot be pickled."""
+        return Nested, (self.function, self.structure, self.inner)
+
+    def __call__(self, leaves: Sequence[Any], *arguments: Any, **options: Any) -> Any:
+        """The outer function's result; a leaf with an inner function is a tuple of its arguments and keywords."""
+        pairs = zip(self.inner, leaves, strict=True)
+        held = [leaf if inner is None else Partial(inner, *leaf[0], **leaf[1]) for inner, leaf in pairs]
+        leading, keywords = jax.tree.unflatten(self.structure, held)
+        return self.function(*leading, *arguments, **keywords, **options)
+
+
+def unnested(function: Partial) -> Partial:
+    """A ``Partial`` whose arguments hold no other ``Partial``."""
+    leaves, structure = jax.tree.flatten((function.args, function.keywords), is_leaf=_is_partial)
+    if not any(map(_is_partial, leaves)):
+        return function
+    flat = [unnested(leaf) if _is_partial(leaf) else leaf for leaf in leaves]
+    inner = [each.func if _is_partial(each) else None for each in flat]
+    numbers = [(each.args, each.keywords) if _is_partial(each) else each for each in flat]
+    return Partial(Nested(function.func, structure, inner), tuple(numbers))
+
+
+def _is_partial(thing: object) -> TypeGuard[Partial]:
+    """True for a function with some of its arguments."""
+    return isinstance(thing, Partial)
+
+
 class OfNumbers:
     """A function of the numbers that it reads under ``names``, and of its own arguments."""
 
     def __init__(self, function: Callable, names: Sequence[str]):
-        assert isinstance(function, types.FunctionType)  # other callables read nothing by name
+        assert isinstance(function, (types.FunctionType, Nested))  # other callables read nothing by name
         self.function, self.names = function, tuple(names)
         self.__code__ = function.__code__  # distinguishes it from others, together with its mark
         own = inspect.signature(function)
@@ -231,7 +278,7 @@ class OfNumbers:
         return _reading(self.function, dict(zip(self.names, numbers, strict=True)))(*arguments, **options)
 
 
-def _reading(function: types.FunctionType, numbers: dict[str, Any]) -> types.FunctionType:
+def _reading(function: Any, numbers: dict[str, Any]) -> Any:
     """A copy of a function that reads ``numbers`` by name; ``helper.name`` is a name in a function that it calls."""
     values: dict[str, Any] = {}
     for name, number in numbers.items():
@@ -240,6 +287,9 @@ def _reading(function: types.FunctionType, numbers: dict[str, Any]) -> types.Fun
             values.setdefault(helper, {})[inner] = number
         else:
             values[name] = number
+    if isinstance(function, Nested):
+        outer, *inside = (_reading(each, values[str(i)]) if str(i) in values else each for i, each in _each(function))
+        return Nested(outer, function.structure, inside)
     read = _read(function)
     values = {n: _reading(read[n], each) if isinstance(each, dict) else each for n, each in values.items()}
     inner_names, cells = function.__code__.co_freevars, function.__closure__ or ()
@@ -257,8 +307,12 @@ def _reading(function: types.FunctionType, numbers: dict[str, Any]) -> types.Fun
 def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 3) -> dict[str, np.ndarray]:
     """Numbers of these kinds, and real arrays, in the cells and globals that a function's own code names.
 
-    Functions in its cells are included, as ``helper.name``: a drift may call a helper defined next to it.
+    Functions in its cells are included, as ``helper.name``: a drift may call a helper defined next to it. The functions
+    of ``Nested`` are called 0, 1, 2 and so on.
     """
+    if isinstance(function, Nested):
+        each_read = ((i, numbers_read(each, kinds, depth)) for i, each in _each(function))
+        return {f"{i}{INSIDE}{name}": number for i, read in each_read for name, number in read.items()}
     if depth == 0 or not isinstance(function, types.FunctionType) or _writes(function.__code__):
         return {}
     read = _read(function)
@@ -267,6 +321,11 @@ def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 3) ->
         inside = numbers_read(read[name], kinds, depth - 1) if isinstance(read[name], types.FunctionType) else {}
         found |= {f"{name}{INSIDE}{each}": number for each, number in inside.items()}
     return dict(sorted(found.items()))
+
+
+def _each(function: Nested) -> Iterable[tuple[int, Any]]:
+    """The outer function and the inner ones, with their numbers."""
+    return enumerate((function.function, *function.inner))
 
 
 def _read(function: types.FunctionType) -> dict[str, Any]:

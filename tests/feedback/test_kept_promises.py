@@ -3,11 +3,14 @@
 Numbers of one kind of problem are parameters, so that its problems share their programs.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hjbjax as hjb
+from tests.support.compilation import compiling
 
 UNIT, SQUARE, DISC = hjb.Box([-1.0], [1.0]), hjb.Box([-1.0] * 2, [1.0] * 2), hjb.Ball(1.0, 2)
 LINE, PLANE = hjb.Grid([-2.0], [2.0], (81,)), hjb.Grid([-1.5, -1.5], [1.5, 1.5], (41, 41))
@@ -155,3 +158,18 @@ def test_numbers_in_single_precision_do_not_hide_where_to_stop():
     problem = stopped(*jnp.asarray([0.4937225, 0.31637814, 0.33716197], jnp.float32))
     path = hjb.simulate(problem, hjb.march(problem, LINE, 1.0, times=TIMES), [-0.408], 1.0)
     assert path.cost == pytest.approx(path.promised, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse", "ignore:the box decides")
+@pytest.mark.parametrize("kind", ["marched stopping", "avoid"])
+def test_other_numbers_compile_no_other_path(kind):
+    """Also where one solution has an estimate that another lacks: the box error of these depends on the numbers."""
+    problem, solution = answer(kind, jnp.asarray([0.1, 0.2, 0.3]))
+    hjb.simulate(problem, hjb.greedy_feedback(problem, solution), [0.4], 1.0)
+    for numbers in ([0.4, 0.1, 0.2], [0.2, 0.45, 0.05]):
+        with compiling() as programs:
+            problem, solution = answer(kind, jnp.asarray(numbers))
+            for known in (solution, dataclasses.replace(solution, box_error=None, grid_error=None, enclosure=None)):
+                hjb.simulate(problem, hjb.greedy_feedback(problem, known), [0.4], 1.0)
+        assert programs == []

@@ -245,6 +245,65 @@ def test_a_function_that_counts_its_calls_still_does():
     globals()["GAIN"] = before
 
 
+def two_lenses(radius):
+    """A target and an obstacle in functions of numbers and of another function, made anew at every call."""
+
+    def distance(x):
+        return jnp.abs(x[0] - 0.1) - radius
+
+    return distance, lambda x: 0.2 - distance(x)
+
+
+POSED = {
+    "reach, forward": lambda a: hjb.reach(lambda x, u: a * u, UNIT, two_lenses(a)[0], forward=True),
+    "avoid": lambda a: hjb.avoid(lambda x, u: a * u, UNIT, two_lenses(a)[0]),
+    "avoid at the end": lambda a: hjb.avoid(lambda x, u: a * u, UNIT, two_lenses(a)[1], tube=False),
+    "reach and avoid": lambda a: hjb.reach_avoid(lambda x, u: a * u, UNIT, *two_lenses(a)),
+    "Partials in a tuple": lambda a: hjb.Problem(
+        lambda x, u: a * u, jax.tree_util.Partial(sums, tuple(map(jax.tree_util.Partial, two_lenses(a)))), UNIT
+    ),
+    "Partials of keywords": lambda a: hjb.Problem(
+        lambda x, u: a * u, jax.tree_util.Partial(shifted, shift=a, inner=jax.tree_util.Partial(two_lenses(a)[0])), UNIT
+    ),
+    "a Partial in a Partial in a Partial": lambda a: hjb.Problem(
+        jax.tree_util.Partial(negative, jax.tree_util.Partial(negative, jax.tree_util.Partial(lambda x, u: a * u))),
+        square, UNIT,
+    ),
+}  # fmt: skip
+
+
+def sums(functions, x, u):
+    return sum(each(x) for each in functions)
+
+
+def shifted(x, u, shift, inner):
+    return inner(x - shift)
+
+
+def negative(function, *arguments):
+    return -function(*arguments)
+
+
+@pytest.mark.parametrize("name", POSED)
+def test_functions_inside_functions_share_programs(name):
+    """The functions of ``avoid`` are negated inside; another radius, or the same lambda made anew, compiled again."""
+    posed = POSED[name]
+    first, again, other = (closures.settled(posed(a), 1) for a in (0.5, 0.5, 0.75))
+    assert jax.tree.structure(first) == jax.tree.structure(again) == jax.tree.structure(other)
+    assert hash(jax.tree.structure(first)) == hash(jax.tree.structure(other))
+    x, u = np.array([0.3]), np.array([-0.7])
+    for a, found in ((0.5, first), (0.75, other)):
+        for each in ("drift", "cost", "stopping_cost", "running_max", "terminal_cost"):
+            plain, held = getattr(posed(a), each), getattr(found, each)
+            arguments = (x, u) if each in ("drift", "cost") else (x,)
+            if plain is not None:
+                np.testing.assert_allclose(jax.jit(held)(*arguments), plain(*arguments), rtol=1e-6)
+    # settled again, as in every front door, and copied
+    twice = closures.settled(first, 1)
+    assert jax.tree.structure(twice) == jax.tree.structure(first)
+    assert jax.tree.structure(closures.settled(copy.deepcopy(first), 1)) == jax.tree.structure(first)
+
+
 def test_closures_of_other_numbers_are_one_batch():
     problems = [asked(gain, 1, np.array([0.5])) for gain in (0.5, 1.0)]
     values = [each.value[2] for each in hjb.solve_batch(problems, LINE, tol=1e-9, scheme=hjb.Upwind())]

@@ -368,7 +368,7 @@ def _iterate(
         for i, (state, code), residuals in zip(members, run.final, run.histories, strict=True):
             # a run that ended before its initial evaluation still contains the raw guess
             state = with_obstacles(tasks[i], state) if code in CUT else state
-            found[i] = state, code, np.concatenate(residuals)[: int(state.step) + 1]
+            found[i] = state, code, np.concatenate(residuals)[: int(state.progress.evaluations)]
     return found
 
 

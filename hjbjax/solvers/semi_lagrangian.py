@@ -18,8 +18,8 @@ from hjbjax.iteration import arc_iteration, bellman, certificates
 from hjbjax.iteration.arc_iteration import ArcState, ArcTask
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Sweeps
-from hjbjax.iteration.fixed_point import HISTORY
 from hjbjax.iteration.methods import Method
+from hjbjax.iteration.progress import HISTORY
 from hjbjax.markov_chain import memory, node_checks
 from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem.grid import Grid
@@ -137,9 +137,9 @@ def _follow(
     code = host_loop.drive(run, clock)
     task, state, problem = run.task, run.state, on.problem
     ends = problem.target is not None and problem.stopping_cost is None
-    if reached is None and int(state.step) >= 0 and ends and code not in CUT:
+    if reached is None and state.progress.has_begun and ends and code not in CUT:
         reached = np.asarray(_arriving(task, state.number))
-    residuals = np.concatenate(run.residuals)[: int(state.step) + 1]
+    residuals = np.concatenate(run.residuals)[: int(state.progress.evaluations)]
     return Followed(on, scheme, plan, task, state, code, reached, residuals)
 
 
@@ -262,17 +262,17 @@ class _Run(StatesInChunks):
     """The iteration of a task on arcs."""
 
     def __init__(self, task: ArcTask, guess: Nodes, limit: int):
-        super().__init__(task, arc_iteration.begin(task, guess), _run, guess, limit)
+        super().__init__(task, arc_iteration.start(task, guess), _run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
-        """Steps of the first chunk, in addition to the initial evaluation; a step evaluates every arc of a node."""
-        return int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
+        """Evaluations of the first chunk, of the guess and of some steps; each evaluates every arc of a node."""
+        return 1 + int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
 
 
 def finish_arcs(followed: Followed) -> Solution:
     """The solution at the end of a run: values, first actions of the best arcs, bounds, and their description."""
     on, scheme, plan, task, state, code, reached, residuals = followed
-    problem, looked, counted = on.problem, int(state.step) >= 0, np.asarray(task.counted)
+    problem, looked, counted = on.problem, state.progress.has_begun, np.asarray(task.counted)
     state = jax.device_get(state)
     if reached is not None and not reached.all():
         warn_unreached(Reach(reached, reached), undiscounted=task.certificate is not Certificate.ADDITIVE)
@@ -281,11 +281,11 @@ def finish_arcs(followed: Followed) -> Solution:
     policy = np.array(np.asarray(plan.actions)[state.number // len(plan.legs)])
     leaving = None if code in CUT or not looked else _leaving(on, value, policy, task)
     policy[~counted | np.asarray(task.obstacles.ended) | (not looked)] = np.nan
-    best = float(state.best[0])
+    best = float(state.progress.best[0])
     message = within_reach(best) if code is Status.STALLED and np.isfinite(best) else code.message
     solution = solution_at_start(on, value, code)
     solution = dataclasses.replace(
-        solution, policy=policy, message=message, reached=reached, cut=leaving, steps=max(int(state.step), 0),
+        solution, policy=policy, message=message, reached=reached, cut=leaving, steps=state.progress.steps,
         residuals=residuals, enclosure=certificates.enclosure(task.certificate, state.bound) if looked else None,
         discrete=isinstance(problem.controls, Finite),
     )  # fmt: skip

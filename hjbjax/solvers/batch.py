@@ -26,7 +26,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
-from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.schemes import Upwind, check_slopes
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import admissibility, memory, node_checks
@@ -120,6 +120,7 @@ def solve_batch(
         if not isinstance(lane, Problem):
             raise TypeError(f"solve_batch: lane {number} is {shown(lane)}; wanted only problems")
         check_arguments(lane, grid, method, scheme, tol)
+    check_slopes(scheme, "solve_batch: scheme")
     grid.check_indices()
     kind = arguments.as_dtype(dtype)
     grid.check_spacings(kind)

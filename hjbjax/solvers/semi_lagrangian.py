@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import arcs as paths
-from hjbjax.discretisation import edges
-from hjbjax.discretisation.arcs import Arcs, Plan
-from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation import arcs, edges
+from hjbjax.discretisation.arcs import Arcs
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.paths import Paths, Plan
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.discretisation.semi_lagrangian import PathScheme, SemiLagrangian
+from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
 from hjbjax.iteration import arc_iteration, bellman, certificates
 from hjbjax.iteration.arc_iteration import ArcState, ArcTask
 from hjbjax.iteration.certificates import Certificate
@@ -55,13 +55,14 @@ def relaxations(method: Method | None, n: int) -> int:
       ValueError: the method uses the matrix of a chain, or coarser grids.
     """
     if method is None:
-        return Sweeps().count * 2**n
+        return Sweeps().relaxations(n)
     if method.coarsest is None and method.relaxes:
         return 1
-    # the number of relaxations in the sweeps of a chain, see ``Sweeps``
+    # the number of relaxations in the sweeps of a chain
     evaluation = method.filled(Sweeps()).evaluation
-    if method.coarsest is None and isinstance(evaluation, Sweeps):
-        return evaluation.count * 2**n
+    count = None if evaluation is None else evaluation.relaxations(n)
+    if method.coarsest is None and count is not None:
+        return count
     raise ValueError(
         f"solve: SemiLagrangian() follows arcs and does not have a matrix for {method!r}; use "
         "hjb.PolicyIteration(), PolicyIteration(Sweeps(...)) or ValueIteration(), on one grid"
@@ -78,7 +79,8 @@ def arc_bytes(grid: Grid, plan: Plan, dtype: DType) -> int:
 def solve_arcs_on_host(
     problem: Problem,
     grid: Grid,
-    scheme: PathScheme,
+    scheme: Scheme,
+    paths: Paths,
     kind: np.dtype,
     *,
     method: Method | None,
@@ -88,13 +90,13 @@ def solve_arcs_on_host(
     clock: Clock,
 ) -> Solution:
     """The solution by checks, arcs and steps, in this order, as far as the clock allows; may enable float64."""
-    scheme.check(problem, grid)
+    paths.check(problem, grid)
     times = relaxations(method, grid.ndim)
     on = Discretisation(problem, grid, Upwind(), kind)  # for checks that do not involve slopes
     start = None if guess is None else np.asarray(guess, kind)
     try:
         check_on_one_state(problem, grid, scheme)
-        plan = scheme.plan(problem, grid, kind)
+        plan = paths.plan(problem, grid, kind)
         # before all nodes are checked, which takes minutes on a grid that does not fit
         needed = memory.fitting(arc_bytes(grid, plan, kind), grid, max_memory)
         node_checks.check_values(on, clock)
@@ -119,7 +121,7 @@ class Followed(NamedTuple):
     """
 
     on: Discretisation
-    scheme: PathScheme
+    scheme: Scheme
     plan: Plan
     task: ArcTask
     state: ArcState
@@ -129,7 +131,7 @@ class Followed(NamedTuple):
 
 
 def _follow(
-    on: Discretisation, scheme: PathScheme, plan: Plan, tol: float, times: int, guess: Nodes | None, clock: Clock
+    on: Discretisation, scheme: Scheme, plan: Plan, tol: float, times: int, guess: Nodes | None, clock: Clock
 ) -> Followed:
     """Compute the arcs of a plan and iterate on them, as far as the clock allows."""
     task, reached = _prepare(on, plan, tol, times, clock)
@@ -219,7 +221,7 @@ def _traced(on: Discretisation, plan: Plan, *, running: bool) -> tuple[Arcs, bel
     """The arcs of a plan and the prescribed values at the nodes, in the dtype of the solve."""
     on = cast(on, on.dtype)
     obstacles = bellman.obstacles(on)
-    return paths.trace(on, plan, obstacles.fixed, running=running), obstacles
+    return arcs.trace(on, plan, obstacles.fixed, running=running), obstacles
 
 
 _surely_arriving = jax.jit(arc_iteration.surely_arriving)
@@ -300,7 +302,7 @@ def finish_replacement(followed: Followed) -> Solution:
     return dataclasses.replace(solution, message=f"{solution.message} {REASON}")
 
 
-def _said(solution: Solution, scheme: PathScheme) -> Solution:
+def _said(solution: Solution, scheme: Scheme) -> Solution:
     """The solution with the name of its scheme."""
     solution.stats["scheme"] = repr(scheme)
     return solution

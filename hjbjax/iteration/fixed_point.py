@@ -235,7 +235,10 @@ def run(task: Task, state: State, until: Number) -> State:
     state = jax.lax.while_loop(lambda at: at.progress.is_running(until), step, state)
     if not task.by_defect:
         return state
-    return dataclasses.replace(state, policy=bellman.greedy(task.on, state.value, task.obstacles.fixed))
+    policy = bellman.greedy(task.on, state.value, task.obstacles.fixed)
+    # the next chunk continues with the defect of the steps, from which this one may differ by rounding
+    defect = jnp.where(state.progress.code == Status.NONFINITE, policy.defect, state.policy.defect)
+    return dataclasses.replace(state, policy=dataclasses.replace(policy, defect=defect))
 
 
 def _advance(task: Task, state: State, chunk: Scalar) -> State:

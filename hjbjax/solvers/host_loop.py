@@ -144,10 +144,10 @@ def drive(run: Run, clock: Clock) -> Status:
                     break
                 clock.phase = f"step {before + 1} on {run.name}"
                 status = run.advance(chunk)
-                clock.count(time.perf_counter() - began, max(run.steps - before, 1), run.nodes)
+                done = max(run.steps - before, 1)  # the evaluation of a guess takes less time than a step
+                clock.count(time.perf_counter() - began, done, run.nodes)
                 # the timing of a short chunk is inaccurate, so the next chunk is at most 8 times as long
-                steps = clock.steps_in(CHUNK_SECONDS, run.nodes)
-                chunk = int(np.clip(steps, 1, min(run.longest, 8 * max(chunk, 1))))
+                chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, run.nodes), 1, min(run.longest, 8 * done)))
                 if bar is not None:
                     run.show(bar)
         except KeyboardInterrupt:  # a second Ctrl-C, or a custom handler

@@ -96,3 +96,26 @@ def test_a_guess_is_measured_by_its_residual_only_where_a_certificate_bounds_its
         state = jax.jit(fixed_point.run)(task, fixed_point.start(task, np.zeros(11)), 1)
         assert np.isfinite(state.bound.residual)
         assert np.isfinite(state.bound.error) == bounded
+
+
+def pushed(x, u, d):
+    return jnp.stack([jnp.cos(x[1]) + 0.5 * d[0], u[0]])
+
+
+def quadratic(x, u, d):
+    return x @ x + u @ u - d @ d
+
+
+def test_chunks_of_value_iteration_change_no_bit():
+    """The actions are computed at the end of a chunk, with a defect that differs by rounding from the loop's."""
+    box, grid = hjb.Box([-1.0], [1.0]), hjb.Grid([-2.0, -2.0], [2.0, 2.0], (21, 20), periodic=(False, True))
+    problem = hjb.Problem(pushed, quadratic, box, discount=1.0, disturbances=box)
+    on = Discretisation(problem, grid, hjb.Upwind(), np.float64).settled
+    task, _, _ = prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-12)
+    assert task.by_defect
+    run = jax.jit(fixed_point.run)
+    whole = run(task, fixed_point.start(task, np.zeros(grid.shape)), 101)
+    state = fixed_point.start(task, np.zeros(grid.shape))
+    for until in (1, 2, 10, 11, 74, 101):
+        state = run(task, state, until)
+    np.testing.assert_array_equal(state.value, whole.value)

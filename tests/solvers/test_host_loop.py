@@ -184,6 +184,24 @@ def test_overflow_stops_with_the_last_finite_value():
     assert not np.isfinite(solution.residuals[-1])
 
 
+@pytree_dataclass()
+class Burst:
+    """A cost that is NaN for one control."""
+
+    center: float
+
+    def cost(self, x, u):
+        return x @ x + jnp.where(jnp.abs(u[0] - self.center) < 1e-3, jnp.nan, u[0] ** 2)
+
+
+def test_nan_during_the_steps_is_not_convergence():
+    points = np.linspace(-1.0, 1.0, 41)  # more than the checks before a solve try: they pass over the fourth
+    hidden = question(cost=Burst(points[3]).cost, controls=hjb.Finite(points[:, None]))
+    with pytest.raises(hjb.SolveError, match="NONFINITE") as caught:
+        hjb.solve(hidden, GRID, scheme=hjb.Upwind())
+    assert np.all(np.isfinite(caught.value.solution.value))
+
+
 @pytest.fixture
 def pressed(monkeypatch):
     """Ctrl-C from another thread a while after the first chunk of a solve began; when it was pressed.

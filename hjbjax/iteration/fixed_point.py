@@ -236,9 +236,8 @@ def run(task: Task, state: State, until: Number) -> State:
     if not task.by_defect:
         return state
     policy = bellman.greedy(task.on, state.value, task.obstacles.fixed)
-    # the next chunk continues with the defect of the steps, from which this one may differ by rounding
-    defect = jnp.where(state.progress.code == Status.NONFINITE, policy.defect, state.policy.defect)
-    return dataclasses.replace(state, policy=dataclasses.replace(policy, defect=defect))
+    # the next chunk continues with the defect of the steps, from which that of the actions may differ by rounding
+    return dataclasses.replace(state, policy=dataclasses.replace(policy, defect=state.policy.defect))
 
 
 def _advance(task: Task, state: State, chunk: Scalar) -> State:
@@ -297,7 +296,7 @@ def _relaxed_by_defect(task: Task, state: State, chunk: Scalar) -> State:
     code = status_after(task, value, bound, measured)
     found = dataclasses.replace(state, value=value, bound=bound, progress=measured.judge(bound, code))
     after = keep_finite(code, found, dataclasses.replace(state, progress=found.progress))
-    return dataclasses.replace(after, policy=policy)  # also for a step that is undone, since ``run`` recomputes it
+    return dataclasses.replace(after, policy=policy)  # also for a step that is undone, since no step follows
 
 
 def _is_first(state: State) -> jax.Array:
@@ -366,6 +365,8 @@ def nonfinite_nodes(task: Task, state: State) -> jax.Array:
         return ~jnp.isfinite(bellman.relaxation(task.on, task.impose(state.value))[0])
     before = dataclasses.replace(state.progress, evaluations=state.progress.evaluations - 1)
     state = dataclasses.replace(state, progress=before)
+    if task.by_defect:  # the defect is that of the undone step
+        state = dataclasses.replace(state, policy=bellman.greedy(task.on, state.value, task.obstacles.fixed))
     value = task.impose(state.value + _correction(task, state))
     rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost, first_order=task.first_order).defect
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))

@@ -34,7 +34,7 @@ from hjbjax.problem.pytree import cast, front_door, is_traced, numbers, pytree_d
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, DType, Field, Number, Numbers, State
 from hjbjax.solution.status import warn
-from hjbjax.tracing import components
+from hjbjax.tracing import checks, components
 
 
 @pytree_dataclass()
@@ -315,6 +315,8 @@ def signal(on: Discretisation, measured: Measurement, name: str) -> Any:
 
 def _prior(on: Discretisation, given: Callable | Numbers, name: str) -> Any:
     """The initial density, shape (*grid), of integral one."""
+    if callable(given):
+        checks.function_of(given, f"{name}: initial_density", (), x=(on.grid.ndim,))
     density = on.at_nodes(given) if callable(given) else numbers(given, f"{name}: initial_density")
     if np.shape(density) != on.grid.shape:
         raise ValueError(

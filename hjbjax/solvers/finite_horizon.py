@@ -142,6 +142,7 @@ def march(
         solved = () if method.limited else (method.evaluation or march_evaluation(problem, grid, divided=True),)
         mesh = checks.over_devices(mesh, "march", problem, grid, scheme, method, *solved, traced=traced)
     if traced:
+        checkpoints.refuse_checkpoint(checkpoint, resume, "march")
         on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))
         return _march_traced(on, horizon, kept, start, method, step, inner, throw)
     kind = arguments.as_dtype(dtype)

@@ -98,7 +98,21 @@ def test_an_interrupt_on_the_host_is_one_for_the_caller(by, monkeypatch):
         jax.grad(value)(0.5) if by == "grad" else jax.vmap(value)(jnp.ones(2))
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("door", ["solve", "march"])
+@pytest.mark.parametrize("option", [{"checkpoint": "run.npz"}, {"resume": True}])
+def test_a_checkpoint_inside_a_transformation_is_refused(door, option):
+    """It was ignored, and a run of hours had no file."""
+    line = hjb.Grid([-1.0], [1.0], (9,))
+
+    def value(weight):
+        problem = hjb.Problem(lambda x, u: weight * u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+        found = hjb.solve(problem, line, **option) if door == "solve" else hjb.march(problem, line, 1.0, **option)
+        return found.value.sum()
+
+    with pytest.raises(ValueError, match=f"^{door}: checkpoint= and resume= work at host level only"):
+        jax.grad(value)(1.0)
+
+
 def test_ctrl_c_in_the_steps_of_one_lane_ends_all_lanes_and_is_not_an_answer(monkeypatch):
     """The caller's loop would go on with NaN, after the other lanes have run to their ends."""
     line = hjb.Grid([-1.0], [1.0], (9,))
@@ -119,6 +133,7 @@ def test_ctrl_c_in_the_steps_of_one_lane_ends_all_lanes_and_is_not_an_answer(mon
         jax.vmap(value)(np.array([0.5, 1.0, 2.0]))
 
 
+@pytest.mark.slow
 def test_the_value_of_a_game_and_its_derivative():
     """It was DIVERGED in its first step, and returned (186, 6.5e14)."""
 

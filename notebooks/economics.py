@@ -14,7 +14,7 @@
 # # Growth, a portfolio, and a put
 #
 # Three problems of economics, each with a known answer. The equation of dynamic programming is the same as in control;
-# utility enters as a negative cost.
+# utility and payoffs are rewards, which are maximised.
 
 # %%
 import warnings
@@ -37,8 +37,8 @@ warnings.simplefilter("ignore", hjb.SolveWarning)
 
 # %%
 capital = hjb.Problem(
-    lambda k, c: k**0.36 - 0.05 * k - c, lambda k, c: -(c[0] ** 0.64) / 0.64, hjb.Box([1e-3], [20.0]), discount=0.04,
-    control_names=("consumption",),
+    lambda k, c: k**0.36 - 0.05 * k - c, controls=hjb.Box([1e-3], [20.0]), discount=0.04,
+    reward=lambda k, c: c[0] ** 0.64 / 0.64, control_names=("consumption",),
 )  # fmt: skip
 grid = hjb.Grid([1.5], [9.5], (201,), names=("capital",), edges="constrained")
 growth = hjb.solve(capital, grid)
@@ -79,19 +79,19 @@ assert abs(portfolio.control_at([0.0])[0] - best.share) < 0.01
 rate, sigma, horizon = 0.06, 0.3, 1.0
 
 
-def shortfall(x):
-    return -jnp.maximum(1 - jnp.exp(x[0]), 0.0)  # a cost: minus the payoff
+def payoff(x):
+    return jnp.maximum(1 - jnp.exp(x[0]), 0.0)
 
 
 def price(early):
     return hjb.Problem(
-        lambda x, u: jnp.stack([rate - sigma**2 / 2 + 0 * x[0]]), noise=sigma, discount=rate, terminal_cost=shortfall,
-        stopping_cost=shortfall if early else None,
+        lambda x, u: jnp.stack([rate - sigma**2 / 2 + 0 * x[0]]), noise=sigma, discount=rate, terminal_reward=payoff,
+        stopping_reward=payoff if early else None,
     )  # fmt: skip
 
 
 line = hjb.Grid([-2.0], [2.0], (201,), names=("log price",))
-american, european = (-hjb.march(price(early), line, horizon).value[0] for early in (True, False))
+american, european = (hjb.march(price(early), line, horizon).value[0] for early in (True, False))
 spot = np.exp(line.axis(0))
 d = (np.log(spot) + (rate - sigma**2 / 2) * horizon) / (sigma * np.sqrt(horizon))
 formula = np.exp(-rate * horizon) * norm.cdf(-d) - spot * norm.cdf(-d - sigma * np.sqrt(horizon))

@@ -50,6 +50,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import front_door
+from hjbjax.problem.rewards import refuse_rewards
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
@@ -343,6 +344,7 @@ def _check_problem(problem: object, gamma: float) -> None:
     """Raise if V of the problem does not show a gain."""
     if not isinstance(problem, Problem):
         raise TypeError(f"hinf_level: problem_of_gamma({gamma:g}) returned {problem!r:.60}, wanted a Problem")
+    refuse_rewards(problem, "hinf_level", "V shows a gain by the energy of an output, which is a cost")
     if not isinstance(problem.disturbances, (Box, Ball)):
         raise ValueError(
             f"hinf_level: problem_of_gamma({gamma:g}) has disturbances {problem.disturbances!r:.60}; wanted a Box or a "

@@ -17,6 +17,7 @@ import numpy as np
 
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, front_door, numbers
+from hjbjax.problem.rewards import refuse_rewards
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.problem.types import Array, Number, Numbers
 from hjbjax.solution.solution import Solution
@@ -53,6 +54,9 @@ def attenuation(
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"attenuation: got {type(problem).__name__}, wanted a Problem without disturbances")
+    refuse_rewards(
+        problem, "attenuation", "an L₂ gain is about the energy ½|z|² of an output, which the control keeps small"
+    )
     if problem.is_game:
         raise ValueError(f"attenuation: the problem already has disturbances, {problem.disturbances!r}; remove them")
     if problem.cost is None:

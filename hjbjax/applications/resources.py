@@ -14,6 +14,7 @@ from hjbjax.problem.arguments import INDEXABLE
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door
+from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
@@ -118,6 +119,7 @@ def estimate(
       70
     """
     check_arguments(problem, grid, method, scheme, tol)
+    problem = costs_of(problem)  # resources do not depend on the sign
     kind, free = arguments.as_dtype(dtype), memory.available()
     check_on_one_state(problem, grid, scheme or Upwind())
     chosen = choose(problem, grid, traced=False, method=method)

@@ -25,6 +25,7 @@ from hjbjax._version import __version__
 from hjbjax.cli import run_folder
 from hjbjax.cli.command_line import text_of
 from hjbjax.feedback.path import Path as Trajectory
+from hjbjax.problem.labels import COST
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, SolveError, Status
@@ -123,7 +124,8 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
     facts = [*_facts(solution), *_exact(entry, solution)]
     if path is not None:
         promised = "" if path.promised is None else f"; V at its start {float(path.promised):.4g}"
-        facts.append(("cost of the path", f"{float(path.cost):.4g}{promised}"))
+        paid = path.cost if path.payoff == COST else path.reward
+        facts.append((f"{path.payoff} of the path", f"{float(paid):.4g}{promised}"))
     facts += [("warning", str(each.message)) for each in heard]
     drawn = tuple((caption, webp(figure)) for caption, figure in pictures)
     return Card(entry.name, entry.summary, solution.status.name, tuple(facts), drawn)

@@ -31,6 +31,7 @@ from hjbjax.plotting.maps import closed_loop_size
 from hjbjax.plotting.slices import at_states
 from hjbjax.plotting.style import NARROW, save_figure
 from hjbjax.problem import streams
+from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.solution import placement
@@ -331,7 +332,7 @@ def json_report(solution: Solution, path: Trajectory | None, files: Sequence[Pat
         "start": path.states[0],
         "end": path.states[-1],
         "duration": path.times[-1],
-        "cost": path.cost,
+        path.payoff: path.cost if path.payoff == COST else path.reward,
         "promised": path.promised,
         "status": path.status.name,
         "message": path.message,

@@ -23,6 +23,7 @@ def check_problem(problem: object, tol: float, max_nodes: int) -> None:
         ("noise", "pontryagin solves deterministic problems; solve it on a grid"),
         ("disturbances", "a game has a saddle point, not a minimum; solve it on a grid"),
         ("stopping_cost", "stopping is not an end condition of (8.7); solve it on a grid"),
+        ("stopping_reward", "stopping is not an end condition of (8.7); solve it on a grid"),
         ("running_max", "a running maximum is not an integral; solve it on a grid"),
     ):
         if getattr(problem, name) is not None:

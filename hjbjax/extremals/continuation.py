@@ -16,6 +16,7 @@ from hjbjax.extremals import initial_guess, necessary_conditions, second_order
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Limits
 from hjbjax.extremals.collocation import collocate, split_at_seams
 from hjbjax.extremals.necessary_conditions import Extremal, assemble_extremal, entry_time, last_iterate, only_touches
+from hjbjax.problem.labels import COST
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import CUT, Stopped
 from hjbjax.solution.status import Status
@@ -271,7 +272,9 @@ def report(found: Outcome) -> Extremal:
         return dataclasses.replace(extremal, code=int(Status.STALLED), message=worse)
     count = len(extremal.switches)
     jumps = f", {count} switch{'es' * (count != 1)}" if found.bvp.rule.jumps else ""
-    said = f"an extremal of cost {extremal.cost:.6g} over {extremal.horizon:.6g}{jumps}, {len(found.s)} nodes"
+    payoff = found.bvp.problem.payoff
+    paid = extremal.cost if payoff == COST else extremal.reward
+    said = f"an extremal of {payoff} {paid:.6g} over {extremal.horizon:.6g}{jumps}, {len(found.s)} nodes"
     return dataclasses.replace(extremal, message=said)
 
 

@@ -16,14 +16,17 @@ import numpy as np
 
 from hjbjax.extremals import arguments, continuation, equilibria, initial_guess, switching
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing, Law, Limits
-from hjbjax.extremals.necessary_conditions import Extremal
+from hjbjax.extremals.necessary_conditions import Extremal, with_payoff
 from hjbjax.hamiltonian.pointwise import rule_of
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.rewards import costs_of, negative
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
+from hjbjax.solution.rewards import in_costs
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.tracing import checks, closures
@@ -74,7 +77,7 @@ def pontryagin(
     jumps. In this case smoothing finds the order of the values, and the switching times are additional unknowns.
 
     Args:
-      problem: deterministic, with one player, and without ``stopping_cost`` and ``running_max``.
+      problem: deterministic, with one player, costs or rewards, and without ``stopping_cost`` and ``running_max``.
       x0: the state at time 0, shape (n,), outside the target.
 
     Keyword Args:
@@ -114,10 +117,13 @@ def pontryagin(
         raise ValueError("pontryagin: got traced values, but it runs on the host: call it outside jit, vmap and grad")
     arguments.check_problem(problem, tol, max_nodes)
     start = arguments.state_of_numbers(x0, "x0")
-    # check with ψ as the terminal cost, so that a ψ of the wrong shape is refused before anything compiles
-    paid = dataclasses.replace(problem, terminal_cost=terminal) if callable(terminal) else problem
-    checks.of_one_state(paid, len(start), "the length of x0")
     arguments.check_guess(guess, len(start), horizon)
+    problem, guess = costs_of(problem), _guess_in_costs(guess)
+    if callable(terminal):
+        terminal = terminal if problem.payoff == COST else negative(terminal)
+    # check with ψ as the terminal cost, so that a ψ of the wrong shape is refused before anything compiles
+    paid = altered(problem, terminal_cost=as_partial(terminal)) if callable(terminal) else problem
+    checks.of_one_state(paid, len(start), "the length of x0")
     arguments.check_grid(grid, len(start))
     problem = closures.settled(problem, len(start))
     if callable(terminal):
@@ -150,9 +156,15 @@ def pontryagin(
             if stop.reached is None:
                 raise SolveError(f"pontryagin: {stop.status} before there was an initial guess or a path") from None
             extremal = continuation.report(stop.reached)
+    extremal = with_payoff(extremal, problem.payoff)
     if throw and extremal.status is not Status.CONVERGED:
         raise SolveError(f"pontryagin: {extremal.status}: {extremal.message}", extremal)
     return extremal
+
+
+def _guess_in_costs(guess: Solution | Extremal | None) -> Solution | Extremal | None:
+    """The guess with the value or the costates of costs."""
+    return in_costs(guess) if isinstance(guess, Solution) else guess and with_payoff(guess, COST)
 
 
 def _pose(
@@ -173,7 +185,8 @@ def _pose(
     free = isinstance(horizon, FreeTime) or (horizon is None and closing is not Closing.REST)
     if free and horizon is None and closing is Closing.COST:
         raise ValueError(
-            "pontryagin: got a terminal cost and no horizon; pass horizon=T, or FreeTime(guess) to determine it"
+            f"pontryagin: got a terminal {problem.payoff} and no horizon; pass horizon=T, or FreeTime(guess) to "
+            "determine it"
         )
     if isinstance(horizon, FreeTime) and terminal is None and problem.target is not None:
         closing = Closing.TARGET

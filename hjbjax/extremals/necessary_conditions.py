@@ -6,6 +6,9 @@ equations have no derivative (such as √y for a body at rest), a cost with kink
 although the method expects a smooth minimum, and ends on the boundary of a target.
 """
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +16,7 @@ import numpy as np
 from hjbjax.extremals.boundary_value import BoundaryValueProblem, Closing
 from hjbjax.extremals.collocation import on_mesh, pad_mesh
 from hjbjax.hamiltonian import pointwise
+from hjbjax.problem.labels import COST
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, samples
 from hjbjax.problem.streams import encodable
@@ -46,7 +50,7 @@ class Optimality:
     scale: Number
 
 
-@pytree_dataclass(host=("message",))
+@pytree_dataclass(static=("payoff",), host=("message",))
 class Extremal:
     """A path with costates that meets Pontryagin's conditions; ``plotting`` draws it like any path.
 
@@ -54,14 +58,16 @@ class Extremal:
       times: shape (k+1,), increasing; the mesh of the solver.
       states: shape (k+1, n), periodic states unwound.
       controls: shape (k, m), at the start of each interval.
-      costates: p, shape (k+1, n); current-value, so compare with DV along the path.
-      values: the cost to go along the path, discounted to each time, shape (k+1,).
+      costates: p, shape (k+1, n); current-value, so compare with DV along the path: of the cost, or of the reward.
+      values: the cost to go along the path, or the reward to come, discounted to each time, shape (k+1,).
       switches: the times at which the control jumps.
-      cost: the total cost from x₀, including the cost at the end or after it.
+      cost: the total cost from x₀, including the cost at the end or after it; minus ``reward`` if the problem has
+        rewards.
       horizon: the final time; for an infinite horizon, the time at which it was truncated.
       optimality_check: an ``Optimality``.
       code: a ``Status`` number.
       message: a sentence on how the solve ended; not traceable.
+      payoff: "cost" or "reward", the payments of the problem.
     """
 
     times: Array
@@ -75,6 +81,12 @@ class Extremal:
     optimality_check: Optimality
     code: int | Array
     message: str = ""
+    payoff: str = COST
+
+    @property
+    def reward(self) -> Any:
+        """The total reward from x₀, minus the cost."""
+        return 0 - self.cost
 
     @property
     def status(self) -> Status:
@@ -82,10 +94,25 @@ class Extremal:
         return Status(int(self.code))
 
     def __repr__(self) -> str:
-        return f"Extremal({self.status}: cost {float(self.cost):.6g} over {float(self.horizon):.6g})"
+        paid = float(self.cost if self.payoff == COST else self.reward)
+        return f"Extremal({self.status}: {self.payoff} {paid:.6g} over {float(self.horizon):.6g})"
 
     def __str__(self) -> str:
         return encodable(f"{self.status}: {self.message}")
+
+
+def with_payoff(extremal: Extremal, payoff: str) -> Extremal:
+    """The extremal with costates, values and H of costs or of rewards; the solver's are those of costs."""
+    if extremal.payoff == payoff:
+        return extremal
+    check = extremal.optimality_check
+    return dataclasses.replace(
+        extremal,
+        costates=0 - extremal.costates,
+        values=0 - extremal.values,
+        optimality_check=dataclasses.replace(check, hamiltonian=0 - check.hamiltonian),
+        payoff=payoff,
+    )
 
 
 @jax.jit

@@ -26,9 +26,11 @@ from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_jax, as_partial, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
+from hjbjax.solution.rewards import in_costs
 from hjbjax.solution.solution import Solution
 from hjbjax.tracing.closures import settled
 
@@ -259,7 +261,7 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
     m = np.shape(solution.policy)[-1:] if solution.policy is not None else (problem.controls.dim,)
     if m != (problem.controls.dim,) or (problem.is_game and solution.disturbance is None):
         raise ValueError("greedy_feedback: the solution belongs to another problem; its players differ")
-    return GreedyFeedback(settled(problem, solution.grid.ndim), solution)
+    return GreedyFeedback(settled(costs_of(problem), solution.grid.ndim), in_costs(solution))
 
 
 def _minimax(greedy: GreedyFeedback, where: tuple, costate: Array) -> tuple[Array, Array]:

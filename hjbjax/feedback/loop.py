@@ -209,7 +209,7 @@ def check_shapes(loop: Loop, x0: Array) -> None:
         ("feedback", loop.control, "tx", (m,)),
         ("disturbance", loop.opponent, "tx", (opponents,)),
         ("drift", problem.drift, action, (n,)),
-        ("cost", problem.cost, action, ()),
+        (problem.payoff, problem.cost, action, ()),
         ("target", problem.target, place, ()),
     ):
         if function is None:

@@ -24,6 +24,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, cast, front_door, is_traced, numbers
+from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Key, Numbers
 from hjbjax.solution.status import warn
@@ -60,7 +61,7 @@ def simulate_output(
     ``vmap``) it computes in the type of x0, without checks, and has forward derivatives (``jacfwd``).
 
     Args:
-      problem: the plant and its costs; not a game.
+      problem: the plant and its costs or rewards; not a game.
       observer: an ``Observer``, for example ``ExtendedKalman``, ``Luenberger`` or ``GridFilter``.
       control: a function of the observer's state that returns the control, shape (m,), or a Solution or
         ``greedy_feedback``, which is evaluated at the observer's estimate (certainty equivalence). Where a Solution has
@@ -193,7 +194,7 @@ def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
             f"simulate_output: the observer is a {type(observer).__name__} without {' and '.join(missing)}, wanted an "
             "Observer, with initial(), update(state, u, dy, dt) and estimate(state)"
         )
-    problem = closures.settled(problem, n)
+    problem = closures.settled(costs_of(problem), n)
     checks.of_one_state(problem, n, "the number of states in x0")
     return problem
 

@@ -71,6 +71,7 @@ class OutputPath:
       estimates: the observer's estimates, shape (k+1, n); the first one precedes all measurements.
       information: the last information state of the observer.
       cost: ∫ e^{−βt} L dt, plus the discounted exit cost if the target was reached, else the discounted terminal cost.
+        For a problem with rewards it is minus ``reward``.
       reached: the time at which the target was reached; inf if it was not.
       code: a PathStatus number.
     """
@@ -84,6 +85,11 @@ class OutputPath:
     cost: Any
     reached: Any
     code: Any
+
+    @property
+    def reward(self) -> Any:
+        """The discounted reward, minus the cost."""
+        return 0 - self.cost
 
     @property
     def status(self) -> PathStatus:

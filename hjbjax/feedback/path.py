@@ -1,11 +1,13 @@
 """The result of a simulation: a path, the reason for its end, and a one-line message."""
 
+import dataclasses
 import enum
 from typing import Any
 
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, holds
 from hjbjax.problem.streams import encodable
@@ -51,7 +53,7 @@ class Interrupted(KeyboardInterrupt):
         self.path = path
 
 
-@pytree_dataclass(static=("held",), host=("message",))
+@pytree_dataclass(static=("held", "payoff"), host=("message",))
 class Path:
     """The history of a closed loop, truncated at its end.
 
@@ -62,7 +64,8 @@ class Path:
       disturbances: shape (k, l), like controls, or None if there is no opponent.
       cost: discounted running cost plus the payment at the end: the discounted exit cost on the target, ψ where V = ψ,
         and what ``march`` assumed at the horizon. For a tube, the cost of the best moment to stop: the least ψ on the
-        way, the largest ``running_max``, or with both the least of max{ψ, largest ``running_max`` so far}.
+        way, the largest ``running_max``, or with both the least of max{ψ, largest ``running_max`` so far}. For a
+        problem with rewards it is minus ``reward``.
       reached: the time at which the target was reached, or None.
       code: a PathStatus number.
       steps: internal steps of the integrator, including rejected ones.
@@ -70,6 +73,7 @@ class Path:
       promised: V at the start if the feedback has a Solution, otherwise None. V is the mean cost, including the cost
         after the end of a short path, up to errors of the grid and the integrator.
       held: True if each control was constant through its interval, so that plots show steps.
+      payoff: "cost" or "reward", the payments of the problem.
     """
 
     times: Any  # NumPy arrays and numbers from `simulate`; JAX arrays from `rollout`, with more axes under vmap
@@ -83,6 +87,18 @@ class Path:
     message: str = ""
     promised: Any = None
     held: bool = False
+    payoff: str = COST
+
+    @property
+    def reward(self) -> Any:
+        """The discounted reward of the path, minus its cost; the value of the problem is the largest mean reward."""
+        return 0 - self.cost
+
+    @property
+    def total(self) -> str:
+        """The cost or the reward in words, with V at the start if it is known."""
+        paid = float(self.cost if self.payoff == COST else self.reward)
+        return f"{self.payoff} {paid:.6g}" + ("" if self.promised is None else f" (V promised {self.promised:.6g})")
 
     @property
     def status(self) -> PathStatus:
@@ -93,7 +109,8 @@ class Path:
         if is_traced(self) or np.ndim(self.code):
             return f"Path(states of shape {np.shape(self.states)})"
         end, rows = float(self.times[-1]), len(self.times)
-        return f"Path({self.status.name} at t = {end:.6g}, {rows} times, cost {float(self.cost):.6g})"
+        paid = dataclasses.replace(self, promised=None).total
+        return f"Path({self.status.name} at t = {end:.6g}, {rows} times, {paid})"
 
     def __str__(self) -> str:
         return encodable(self.message)  # a terminal may lack a character, and print would raise
@@ -124,15 +141,11 @@ def join_paths(first: Path, then: Path, discount: float) -> Path:
         reached=None if then.reached is None else end + then.reached,
         code=then.code,
         steps=steps,
-        message=f"{said}; cost {cost:.6g}{_beside(first.promised)}; {steps} internal steps",
+        message=f"{said}; {dataclasses.replace(first, cost=cost).total}; {steps} internal steps",
         promised=first.promised,
         held=first.held or then.held,
+        payoff=first.payoff,
     )
-
-
-def _beside(promised: float | None) -> str:
-    """The words about V, placed after the cost."""
-    return "" if promised is None else f" (V promised {promised:.6g})"
 
 
 def truncate(
@@ -155,7 +168,7 @@ def truncate(
         where += f", x = [{', '.join(f'{entry:.4g}' for entry in states[-1])}]"
     said = [
         f"{status.message} at {where}",
-        f"cost {float(path.cost):.6g}{_beside(path.promised)}",
+        path.total,
         f"{int(path.steps)} internal steps",
     ]
     # a path continues outside only with clamp=True; its periodic states are unwound, so they may leave the box
@@ -181,6 +194,7 @@ def truncate(
         message="; ".join(said),
         promised=path.promised,
         held=path.held,
+        payoff=path.payoff,
     )
 
 

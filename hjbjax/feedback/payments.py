@@ -20,11 +20,13 @@ import numpy as np
 
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.interpolation import Samples, between, query
+from hjbjax.solution.rewards import in_costs
 from hjbjax.solution.solution import Solution
 from hjbjax.tracing.closures import settled
 from hjbjax.tracing.components import of_state
@@ -61,9 +63,12 @@ class Lookup:
 
 
 def solution_of(feedback: object) -> Solution | None:
-    """The Solution of a feedback: the feedback itself, or the Solution from which it was made; otherwise None."""
+    """The Solution of a feedback: the feedback itself, or the Solution from which it was made; otherwise None.
+
+    Its value is a cost, like everything in this file.
+    """
     solution = feedback if isinstance(feedback, Solution) else getattr(feedback, "solution", None)
-    return solution if isinstance(solution, Solution) else None
+    return in_costs(solution) if isinstance(solution, Solution) else None
 
 
 def is_tube(problem: Problem) -> bool:
@@ -206,21 +211,23 @@ def broken_promise(
     ahead = still_ahead(problem, feedback, path, to_horizon=to_horizon)
     if ahead is None or not np.all(inside[:-1]):
         return None
-    total = _combined(problem, float(path.cost), ahead)
-    off = total - path.promised
+    total, promised = _combined(problem, float(path.cost), ahead), promise(feedback, states[0])
+    assert promised is not None
+    off = total - promised
     if off <= 0 and not worst_case:
         return None
     if abs(off) <= _allowed(solution) or abs(off) <= LEAST * _range_of_extremes(problem, solution):
         return None
     if not _is_answer_to(problem, solution, path):
         return None
-    further = "" if ahead == 0 else f" with the cost that V predicts afterwards, {ahead:.4g},"
+    word, sign, verb = (COST, 1, "costs") if path.payoff == COST else (path.payoff, -1, "earns")
+    further = "" if ahead == 0 else f" with the {word} that V predicts afterwards, {sign * ahead:.4g},"
     advice = (
-        "the feedback does not achieve V; use a finer grid, another scheme, a running cost or a discount"
+        f"the feedback does not achieve V; use a finer grid, another scheme, a running {word} or a discount"
         if off > 0
-        else "V is too large there; use a finer grid or a larger box"
+        else f"V is too {'large' if sign > 0 else 'small'} there; use a finer grid or a larger box"
     )
-    return f"the path costs {path.cost:.6g},{further} and V promised {path.promised:.6g}: {advice}"
+    return f"the path {verb} {sign * path.cost:.6g},{further} and V promised {path.promised:.6g}: {advice}"
 
 
 def _is_answer_to(problem: Problem, solution: Solution, path: Path) -> bool:

@@ -16,8 +16,10 @@ from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
 from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced
+from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
@@ -58,7 +60,7 @@ def simulate(
     with the same functions and shapes does not compile again, for any numbers.
 
     Args:
-      problem: the system and its costs.
+      problem: the system and its costs or rewards.
       feedback: a Solution, a ``greedy_feedback``, or a function that returns the control, shape (m,). ``None`` if
         there is no control.
         With a Solution of a problem with a stopping cost, the path ends and pays ψ where stopping is optimal, that is
@@ -87,8 +89,9 @@ def simulate(
       max_steps: the largest number of internal steps; none is shorter than 2·duration/max_steps.
 
     Returns:
-      A Path. If it ends early, except in the target, it warns, and ``status`` and ``message`` say why. It also warns if
-      its cost differs from V by many times the estimated error.
+      A Path, with ``.cost``, and ``.reward`` for a problem with rewards. If it ends early, except in the target, it
+      warns, and ``status`` and ``message`` say why. It also warns if its cost or reward differs from V by many times
+      the estimated error.
 
     Raises:
       ValueError: an argument that is not admissible, or a function that returns the wrong shape.
@@ -118,6 +121,7 @@ def simulate(
             problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=noise_key(problem, key), hold=held,
             rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, due=due, **options,
         )  # fmt: skip
+    problem = costs_of(problem)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
     start = _initial_state(x0, loop.grid)
     loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
@@ -147,7 +151,7 @@ def simulate(
             )
         path, active = _in_chunks(InitialValueProblem(loop, start, times, key), stepping, clock)
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
-        path = dataclasses.replace(path, promised=promise(feedback, start))
+        path = dataclasses.replace(path, promised=_promised(problem, feedback, start), payoff=problem.payoff)
         path = truncate(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
         broken = broken_promise(
             problem, feedback, path, to_horizon=due == "V at the horizon", worst_case=disturbance is None
@@ -245,7 +249,7 @@ def rollout(
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
     key = noise_key(problem, key)
     # numbers that functions close over become leaves, because derivative rules only cover leaves
-    problem = settled(problem, start.size, start.dtype)
+    problem = settled(costs_of(problem), start.size, start.dtype)
     if due is None:
         due = "V at the horizon" if _is_marched(feedback) else "terminal cost"
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
@@ -253,7 +257,8 @@ def rollout(
     loop = dataclasses.replace(loop, control=opened(loop.control, *moment), opponent=opened(loop.opponent, *moment))
     check_shapes(loop, start)
     stepping = Stepping(rtol, atol, np.inf if max_step is None else max_step, max_steps, hold)
-    return integrate(InitialValueProblem(loop, start, jnp.asarray(times, start.dtype), key), stepping)[0]
+    path = integrate(InitialValueProblem(loop, start, jnp.asarray(times, start.dtype), key), stepping)[0]
+    return dataclasses.replace(path, payoff=problem.payoff)
 
 
 def _close(
@@ -301,6 +306,12 @@ def _close(
         problem, control, as_partial(opponent), grid, bool(clamp), surplus(problem, feedback), due,
         value_at_horizon(feedback) if due == "V at the horizon" else None,
     )  # fmt: skip
+
+
+def _promised(problem: Problem, feedback: Feedback, start: np.ndarray) -> float | None:
+    """V at the start in the sign of the problem's payments, if the feedback has a Solution."""
+    cost = promise(feedback, start)
+    return cost if cost is None or problem.payoff == COST else 0 - cost
 
 
 def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:

@@ -33,8 +33,10 @@ from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.rewards import costs_of, refuse_rewards
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Costate, Field, Number, Scalar, State
+from hjbjax.solution.rewards import in_costs
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import warn
 from hjbjax.tracing import checks, closures
@@ -236,7 +238,7 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
     if not is_traced(solution.value) and (bad := int(np.sum(np.isnan(solution.value)))):
         raise ValueError(f"{name}: V is NaN at {bad} nodes, wanted numbers, or infinity if the target is unreachable")
     grid, n = observer.grid, observer.grid.ndim
-    problem = closures.settled(problem, n)
+    problem, solution = closures.settled(costs_of(problem), n), in_costs(solution)
     checks.of_one_state(problem, n, "the number of axes of the filter's grid")
     with _double(problem, solution, observer), jax.ensure_compile_time_eval():
         dtype = np.dtype(jnp.result_type(float))
@@ -294,6 +296,7 @@ def minimum_stress(
     for got, wanted in ((observer, RobustGridFilter), (solution, Solution)):
         if not isinstance(got, wanted):
             raise TypeError(f"{name}: got {type(got).__name__}, wanted a {wanted.__name__}")
+    refuse_rewards(solution.problem, name, "the worst case maximises the past and future cost p + V")
     if solution.times is not None:
         kept = {each: getattr(solution, each) for each in ("value", "policy", "disturbance")}
         first = {each: array[0] for each, array in kept.items() if array is not None}

@@ -10,6 +10,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, is_traced, numbers
+from hjbjax.problem.rewards import refuse_rewards
 from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import checks, components
 
@@ -20,6 +21,7 @@ def check_question(problem: object, grid: object, scheme: Any) -> None:
         raise TypeError(
             f"robust_filter: got {type(problem).__name__}, {type(grid).__name__}; wanted a Problem and a Grid"
         )
+    refuse_rewards(problem, "robust_filter", "the disturbance of the filter maximises the cost minus ½γ²|w|²")
     if problem.is_game or problem.time_dependent:
         what = "an opponent" if problem.is_game else "functions that depend on time"
         raise ValueError(

@@ -18,6 +18,7 @@ from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import decision_process, stationary_law
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast
 from hjbjax.problem.settings import own_settings
@@ -150,11 +151,14 @@ def transition_arrays(
 
         V = min_u [ L^u Δt + P^u V ] / (1 + βΔt),
 
-    so the decision problem with cost L Δt/(1 + βΔt) and factor 1/(1 + βΔt) has exactly the value V_h. A target node
-    keeps its state, at a cost of (1 − factor) times its exit cost. If ``scheme.subcell`` ends a jump on the boundary of
-    the target, L includes the difference between the exit costs at the boundary and at the node. QuantEcon maximises,
-    so its ``DiscreteDP(-costs, probabilities, factor, state_index, action_index)`` has the value −V_h. Requires about
-    20 (2n + 2) bytes per pair.
+    so the decision problem with cost L Δt/(1 + βΔt) and factor 1/(1 + βΔt) has exactly the value V_h. For a problem
+    with rewards the first array holds rewards instead of costs, with max instead of min. A target node keeps its state,
+    at a cost of (1 − factor) times its exit cost. If ``scheme.subcell`` ends a jump on the boundary of the target, L
+    includes the difference between the exit costs at the boundary and at the node. Requires about 20 (2n + 2) bytes per
+    pair.
+
+    QuantEcon maximises. ``DiscreteDP(rewards, probabilities, factor, state_index, action_index)`` has the value V_h of
+    a problem with rewards, and with ``-costs`` it has the value −V_h of a problem with costs.
 
     Args:
       problem: discounted, without disturbances or constraints, with K ``Finite`` controls, or None (K = 1).
@@ -163,7 +167,8 @@ def transition_arrays(
 
     Returns:
       ``(costs (S*K,), probabilities CSR (S*K, S), state_index (S*K,), action_index (S*K,), discount_factor)``,
-      sorted by state, then by action; pairs that lead out of the box across a constrained end are left out.
+      sorted by state, then by action; rewards instead of costs for a problem with rewards. Pairs that lead out of the
+      box across a constrained end are left out.
 
     Raises:
       ValueError: the problem is not such a decision problem, rates or costs are not finite, or the chain cannot
@@ -183,7 +188,8 @@ def transition_arrays(
         (jumps.offsets, jumps.values, cost + decision_process.paid(jumps, surcharge), ~leaving)
         for jumps, cost, leaving in found
     )
-    return decision_process.decision_problem(tables, grid, len(actions), held, given, float(problem.discount))
+    costs, *chain = decision_process.decision_problem(tables, grid, len(actions), held, given, float(problem.discount))
+    return (costs if problem.payoff == COST else 0 - costs, *chain)
 
 
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
@@ -215,7 +221,7 @@ def _checked(
         )
     with own_settings(x64=True):
         jumps, cost, lacking, leaving = jax.device_get(_evaluate(*cast((on, u, d), np.float64), eps))
-    decision_process.refuse("the running cost is not finite", active & ~np.isfinite(cost), grid)
+    decision_process.refuse(f"the running {on.problem.payoff} is not finite", active & ~np.isfinite(cost), grid)
     decision_process.refuse(
         "a jump rate, made of drift and noise, is not finite", active & ~np.isfinite(jumps.total()), grid
     )

@@ -130,7 +130,8 @@ def action_table(problem: Problem) -> np.ndarray:
             "require a factor < 1 (QuantEcon's methods refuse 1)"
         )
     if is_constrained(problem):
-        raise ValueError("transition_arrays: got a stopping_cost or running_max, which a decision problem cannot hold")
+        what = problem.labels.word("a stopping_cost or running_max")
+        raise ValueError(f"transition_arrays: got {what}, which a decision problem cannot hold")
     if problem.time_dependent:
         raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")
     if problem.controls is None:

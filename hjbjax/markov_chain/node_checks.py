@@ -260,7 +260,7 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
     ingredient = getattr(problem, name)
     # a constant is at fault everywhere, so no node is named
     if not callable(ingredient):
-        raise ValueError(f"Problem.{name}: got {np.asarray(ingredient)}, wanted finite numbers")
+        raise ValueError(f"Problem.{problem.labels.word(name)}: got {np.asarray(ingredient)}, wanted finite numbers")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
     raise ValueError(
         f"{call(problem, name)} is NaN or infinite at {where}.\n"

@@ -28,6 +28,7 @@ from hjbjax.plotting.slices import (
 )
 from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend, new_figure, styled
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import Labels
 from hjbjax.problem.types import Number, State
 
 if TYPE_CHECKING:
@@ -83,9 +84,11 @@ def value(
     section = section_of("value", field, solution.grid, fixed, caption)
     ax = axes_of(ax)
     # .data has the masked numbers: infinity means unreachable, NaN must not be labelled so
-    hidden = "V = ∞" if np.all(np.isposinf(section.values.data[section.values.mask])) else "V not finite"
+    name = getattr(solution, "labels", Labels()).of_value
+    lost = section.values.data[section.values.mask]
+    hidden = "V = ∞" if np.all(np.isposinf(lost)) else "V = −∞" if np.all(np.isneginf(lost)) else "V not finite"
     section, regions = _without(section, target_of(solution, time) if target is None else target)
-    artists = draw(ax, section, Look("V", hidden, colorbar), regions)
+    artists = draw(ax, section, Look(name, hidden, colorbar), regions)
     lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
     if len(lines):
         shades = fill_missing(section.values).T

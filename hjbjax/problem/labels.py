@@ -1,4 +1,4 @@
-"""Names and units of states and controls for plots and printed tables, and the side of a level set.
+"""Names and units of states and controls for plots and printed tables, the side of a level set, and cost or reward.
 
 These texts do not enter a computation. They are static, so that they survive ``jit`` and ``vmap``.
 """
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 SIDES = ("below", "above")
+COST, REWARD = "cost", "reward"  # the words for what the control minimises or maximises
 
 
 class Labels(NamedTuple):
@@ -16,15 +17,34 @@ class Labels(NamedTuple):
       controls: one name per control, or empty.
       control_units: one unit per control, or empty; an empty text for a control without a unit.
       inside: "below" if {V ≤ 0} is the set of interest, "above" if it is {V ≥ 0}.
+      payoff: "cost" if the control minimises, "reward" if it maximises. The labels of a ``Solution`` say which of the
+        two its value is.
 
     Example:
       >>> Labels(("torque",), ("N m",)).control(0, 1), Labels().control(1, 2)
       ('torque [N m]', 'u2')
+      >>> Labels(payoff="reward").word("terminal_cost")
+      'terminal_reward'
     """
 
     controls: tuple[str, ...] = ()
     control_units: tuple[str, ...] = ()
     inside: str = "below"
+    payoff: str = COST
+
+    @property
+    def long_name(self) -> str:
+        """V in words, for files of other tools."""
+        return "value function" if self.payoff == COST else f"value function, a {self.payoff}"
+
+    @property
+    def of_value(self) -> str:
+        """The name of V on axes and colour bars."""
+        return "V" if self.payoff == COST else f"V, {self.payoff}"
+
+    def word(self, text: str) -> str:
+        """A name or a phrase about costs, in the words of the problem."""
+        return text.replace(COST, self.payoff)
 
     def control(self, index: int, count: int) -> str:
         """The name and unit of one of ``count`` controls; u, or u1, u2, ... without a name."""
@@ -53,3 +73,11 @@ def checked(controls: object, units: object, inside: object, count: int | None) 
         raise ValueError(f"Problem.inside: got {inside!r}, wanted 'below' (the set is V ≤ 0) or 'above' (V ≥ 0)")
     names = words(controls, count, "Problem.control_names")
     return Labels(names, words(units, count, "Problem.control_units"), str(inside))
+
+
+def of_file(stored: Sequence) -> Labels:
+    """The labels in the header of a file, after checks; older files do not say whether V is a cost or a reward."""
+    names, units, inside, payoff = (*stored, COST)[:4]
+    if payoff not in (COST, REWARD) or len(stored) > 4:
+        raise ValueError(f"labels: got {payoff!r:.60}, wanted {COST!r} or {REWARD!r}")
+    return checked(names, units, inside, None)._replace(payoff=str(payoff))

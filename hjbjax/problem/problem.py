@@ -3,7 +3,8 @@
     min{ max{ β V − V_t − H(x, DV, D²V),  V − ψ },  V − g } = 0
     H = min_u max_d [ L(x,u,d) + f(x,u,d)·DV + ½ tr(σσᵀ(x,u,d) D²V) ]
 
-The control minimises the cost, the disturbance maximises it. All functions act on one state.
+The control minimises the cost, the disturbance maximises it. With rewards instead of costs the control maximises and
+the disturbance minimises. All functions act on one state.
 """
 
 import dataclasses
@@ -15,19 +16,32 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import labels as labelling
-from hjbjax.problem.labels import Labels
+from hjbjax.problem.labels import COST, REWARD, Labels
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
 
+PAYMENTS = {  # the payments of a problem with rewards, and the same payments as costs
+    "reward": "cost",
+    "exit_reward": "exit_cost",
+    "terminal_reward": "terminal_cost",
+    "stopping_reward": "stopping_cost",
+}
+STATIC = ("isaacs", "time_dependent", "control_names", "control_units", "inside", "discounted", "payoff")
 
-@pytree_dataclass(static=("isaacs", "time_dependent", "control_names", "control_units", "inside", "discounted"))
+
+@pytree_dataclass(static=STATIC)
 class Problem:
     """An optimal control problem or a two-player zero-sum differential game.
 
-    Functions act on one state. ``drift``, ``cost`` and a callable ``noise`` take ``(x, u)``; they take
-    ``(x, u, d)`` if ``disturbances`` is given. ``target``, ``exit_cost``, ``terminal_cost``,
-    ``stopping_cost`` and ``running_max`` take ``(x)``. With ``time_dependent=True`` the time comes first in all.
+    Functions act on one state. ``drift``, ``cost``, ``reward`` and a callable ``noise`` take ``(x, u)``; they take
+    ``(x, u, d)`` if ``disturbances`` is given. ``target``, ``running_max`` and the payments ``exit_cost``,
+    ``terminal_cost`` and ``stopping_cost``, or the rewards of the same names, take ``(x)``. With
+    ``time_dependent=True`` the time comes first in all.
+
+    The control minimises costs. Give ``reward`` and the other rewards instead to maximise: the value is then the
+    largest reward, and the disturbance minimises it. Value, bounds, derivatives and pictures have the sign of the
+    rewards. A problem has costs or rewards, not both.
 
     Args:
       drift: f, returns shape (n,): the rate of change of the state.
@@ -44,7 +58,12 @@ class Problem:
       terminal_cost: V at the horizon, for ``march``.
       stopping_cost: ψ, which the controller may pay to stop: V ≤ ψ.
       running_max: g, the cost is the running maximum of g: V ≥ g. Requires zero running cost and no discount.
-      isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min.
+      reward: the reward per unit time, maximised; utility, profit or income. Excludes all costs.
+      exit_reward: the reward received on the target; a number or a function. Default: zero.
+      terminal_reward: V at the horizon, for ``march``: scrap value, bequest or payoff.
+      stopping_reward: the reward for stopping, at any time: V ≥ the reward, as for an American option.
+      isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min. With rewards
+        the disturbance also sees u if ``"upper"``: max over u of min over d.
       time_dependent: True if the functions take the time as their first argument.
       control_names, control_units: one text per control, for plots, as in ("torque",) and ("N m",).
       inside: the side of the zero level that is the set of interest, for plots: ``"below"`` for {V ≤ 0}, ``"above"``
@@ -58,6 +77,10 @@ class Problem:
       >>> import jax.numpy as jnp
       >>> Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, Box([-1.0], [1.0]), discount=1.0).controls.dim
       1
+      >>> Problem(  # wealth earns 3 %; the utility of consumption is maximised
+      ...     lambda x, u: 0.03 * x - u, controls=Box([0.01], [2.0]), reward=lambda x, u: jnp.log(u[0]), discount=0.05
+      ... ).payoff
+      'reward'
     """
 
     drift: jax.tree_util.Partial
@@ -76,7 +99,12 @@ class Problem:
     control_names: tuple[str, ...] = ()
     control_units: tuple[str, ...] = ()
     inside: str = "below"
+    reward: Any = None
+    exit_reward: Any = None
+    terminal_reward: Any = None
+    stopping_reward: Any = None
     discounted: bool | None = dataclasses.field(init=False, default=None, repr=False)
+    payoff: str = dataclasses.field(init=False, default=COST, repr=False)
 
     def __init__(
         self,
@@ -97,6 +125,10 @@ class Problem:
         control_names: Sequence[str] = (),
         control_units: Sequence[str] = (),
         inside: str = "below",
+        reward: Callable | None = None,
+        exit_reward: Callable | Number | None = None,
+        terminal_reward: Callable | Number | None = None,
+        stopping_reward: Callable | Number | None = None,
     ):
         if not callable(drift):
             raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
@@ -114,20 +146,26 @@ class Problem:
                 "Problem.running_max: the cost is only the running maximum; "
                 "leave out cost and discount, or put the running cost into a stopping_cost"
             )
-        if exit_cost is not None and target is None:
-            raise ValueError("Problem.exit_cost: there is no target to pay it on; give target as well")
+        costs = {
+            "cost": cost, "exit_cost": exit_cost, "terminal_cost": terminal_cost, "stopping_cost": stopping_cost,
+        }  # fmt: skip
+        rewards = {
+            "reward": reward, "exit_reward": exit_reward, "terminal_reward": terminal_reward,
+            "stopping_reward": stopping_reward,
+        }  # fmt: skip
+        payoff = _payoff(costs | {"running_max": running_max}, rewards)
+        for name, paid in {"exit_cost": exit_cost, "exit_reward": exit_reward}.items():
+            if paid is not None and target is None:
+                raise ValueError(f"Problem.{name}: there is no target to pay it on; give target as well")
         # every function becomes a pytree, so that numbers in it are leaves of the problem
         fields = {
             "drift": as_partial(drift, "Problem.drift"),
-            "cost": as_partial(cost, "Problem.cost"),
+            **{name: _payment(paid, f"Problem.{name}") for name, paid in (costs | rewards).items()},
             "controls": controls,
             "disturbances": disturbances,
             "noise": _noise(noise),
             "discount": discount,
             "target": as_partial(target, "Problem.target"),
-            "exit_cost": _function_or_number(exit_cost, "Problem.exit_cost"),
-            "terminal_cost": _function_or_number(terminal_cost, "Problem.terminal_cost"),
-            "stopping_cost": _function_or_number(stopping_cost, "Problem.stopping_cost"),
             "running_max": as_partial(running_max, "Problem.running_max"),
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
@@ -136,14 +174,15 @@ class Problem:
             "inside": words.inside,
             # static, because ``jit`` hides numbers and the certificate must be chosen while compiling
             "discounted": None if is_traced(discount) else bool(discount > 0),
+            "payoff": payoff,
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     @property
     def labels(self) -> Labels:
-        """The words for plots: names and units of the controls, and the side of the level set."""
-        return Labels(self.control_names, self.control_units, self.inside)
+        """The words for plots and messages: names and units of the controls, side of the level set, cost or reward."""
+        return Labels(self.control_names, self.control_units, self.inside, self.payoff)
 
     @property
     def is_game(self) -> bool:
@@ -182,6 +221,26 @@ def is_discounted(problem: Problem) -> bool | None:
 def is_constrained(problem: Problem) -> bool:
     """True if the problem has a stopping cost or a running maximum."""
     return problem.stopping_cost is not None or problem.running_max is not None
+
+
+def _payoff(costs: dict[str, Any], rewards: dict[str, Any]) -> str:
+    """The word for the payments of a problem, "cost" or "reward"; refuses both together."""
+    paid, earned = ([name for name, given in each.items() if given is not None] for each in (costs, rewards))
+    if not earned:
+        return COST
+    if not paid:
+        return REWARD
+    cure = "leave out running_max" if paid == ["running_max"] else f"write {paid[0]} as a reward, minus the cost"
+    raise ValueError(
+        f"Problem: got {' and '.join(paid)} together with {' and '.join(earned)}; wanted only costs or only rewards.\n"
+        f"The control minimises a cost and maximises a reward. To maximise, {cure};\n"
+        "to minimise, write the rewards as costs, minus the reward."
+    )
+
+
+def _payment(paid: object, name: str) -> Any:
+    """A running payment as a function, any other payment as a function or a number."""
+    return as_partial(paid, name) if name in ("Problem.cost", "Problem.reward") else _function_or_number(paid, name)  # type: ignore[arg-type]
 
 
 def _is_nonzero(discount: Number) -> bool:

@@ -97,8 +97,7 @@ def fields(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         about.get("edges", "projected"),  # missing in older files, in which all ends are projected
         tuple(about.get("units", ())),  # missing in older files, like the labels
     )  # fmt: skip
-    names, units, inside = header.get("labels", Labels())
-    labels = labelling.checked(names, units, inside, None)
+    labels = labelling.of_file(header.get("labels", Labels()))
     header = {"monotone_error": None, **header}  # missing in older files
     for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``, because True is not a number of steps
         if type(header[name]) not in kinds:
@@ -121,7 +120,7 @@ def dataset(solution: Any) -> "xarray.Dataset":
     own = ["value", "grid_error", "box_error", "reached", "time", "control", "disturbance"]
     names = [f"state {name}" if name in own else name for name in grid.names]
     lead = ("time",) if marched else ()
-    found: dict[str, Any] = {"value": ((*lead, *names), solution.value, {"long_name": "value function"})}
+    found: dict[str, Any] = {"value": ((*lead, *names), solution.value, {"long_name": labels.long_name})}
     described = {
         "grid_error": "estimated error of the grid",
         "box_error": "estimated error of the ends of the box",

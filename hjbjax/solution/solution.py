@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.labels import Labels
+from hjbjax.problem.labels import COST, Labels
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.sets import Finite
@@ -58,7 +58,8 @@ class Solution:
 
     Args:
       grid: the grid.
-      value: V, shape (*grid), in cost units; infinite where the target is unreachable.
+      value: V, shape (*grid), in cost units: the least cost, or for a problem with rewards the largest reward. Where
+        the target is unreachable it is infinite, or minus infinite with rewards.
       policy: u, shape (*grid, m); NaN at nodes where no control is defined.
       disturbance: d, shape (*grid, l), in a game.
       code: a ``Status`` number.
@@ -82,7 +83,7 @@ class Solution:
         not projected; ``None`` if not counted.
       discrete: True if the controls are enumerated, so that the mean of two need not be admissible.
       discrete_disturbance: True if the disturbances are enumerated.
-      labels: names and units of the controls, and the side of the level set, for plots.
+      labels: names and units of the controls, the side of the level set, and whether V is a cost or a reward.
       residuals: one number per step; host data.
       stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
         "certificate" (a sentence), "checkpoint" ("written", or the reason why not), "mesh" (devices along each axis,
@@ -343,10 +344,13 @@ def load(path: Path) -> Solution:
 
 
 def question(problem: Problem) -> dict[str, Any]:
-    """The fields of a ``Solution`` that follow from the problem: labels, and which sets are enumerated."""
+    """The fields of a ``Solution`` that follow from the problem: labels, and which sets are enumerated.
+
+    The value of a solver is a cost; ``rewards.with_rewards`` gives it the sign of the user's problem.
+    """
     return {
         "discrete": isinstance(problem.controls, Finite),
         "discrete_disturbance": isinstance(problem.disturbances, Finite),
-        "labels": problem.labels,
+        "labels": problem.labels._replace(payoff=COST),
         "problem": None if is_traced(problem) else problem,
     }

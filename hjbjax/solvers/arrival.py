@@ -16,6 +16,7 @@ from hjbjax.discretisation.arcs import ArcPath
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import is_constrained
 from hjbjax.problem.pytree import cast
 from hjbjax.problem.types import AtNodes, Nodes
@@ -41,12 +42,14 @@ def warn_of_no_arrival(task: Task, state: State) -> None:
     places = places[:: -(-len(places) // PATHS)]
     start = [np.asarray(task.grid.axis(axis))[index] for axis, index in enumerate(places.T)]
     on, most = task.on.chain, LONG * sum(task.grid.shape)
+    payoff, costs = task.problem.payoff, task.problem.payoff == COST
     share = 1 - float(np.mean(_arrive(on, state.policy.controls, start, most=most)))
     if share > SHARE:
+        most, price = (f"down to {best:.4g}", "positive") if costs else (f"up to {-best:.4g}", "negative")
         warn(
             f"the feedback never arrives from about {share:.0%} of the nodes where V promises a reward on the target "
-            f"(V down to {best:.4g}): time costs nothing there, so resting indefinitely looks as good as arriving. "
-            "Give time a price: a discount > 0, or a positive running cost"
+            f"(V {most}): time costs nothing there, so resting indefinitely looks as good as arriving. "
+            f"Give time a price: a discount > 0, or a {price} running {payoff}"
         )
 
 

@@ -42,6 +42,7 @@ from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint, File
 from hjbjax.solution.clock import CUT, Clock, Stopped, noting_interrupts
 from hjbjax.solution.placement import Path
+from hjbjax.solution.rewards import with_rewards
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers import host_loop, vanishing_discounts
@@ -67,6 +68,7 @@ from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
 
+@with_rewards
 @with_settled_functions
 def solve_batch(
     problems: Iterable[Problem],
@@ -295,7 +297,7 @@ def _solve_together(
             continue
         reach = prepared[name][2]
         if reach is not None and not reach.surely.all():
-            warn_unreached(reach, undiscounted=bool(on.problem.discount == 0))
+            warn_unreached(reach, on.problem.payoff, undiscounted=bool(on.problem.discount == 0))
     left = [name for name in lanes if name not in found]
     if left:
         rest = _solve_chains(

@@ -34,6 +34,7 @@ from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.placement import Path
+from hjbjax.solution.rewards import with_rewards
 from hjbjax.solution.solution import Solution, SolveError, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run, time_probes
@@ -52,6 +53,7 @@ _stable = jax.jit(time_stepping.stable, static_argnames="tableau")
 _obstacles = jax.jit(bellman.obstacles)
 
 
+@with_rewards
 @with_settled_functions
 def march(
     problem: Problem,
@@ -254,7 +256,7 @@ def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:
 def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None, code: Status) -> Solution:
     """The solution of a march that ended before its first step: its initial value; NaN if unknown."""
     value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
-    message = f"The march did not leave t = {horizon:g}. {march_run.ADVICE[code]}"
+    message = f"The march did not leave t = {horizon:g}. {on.problem.labels.word(march_run.ADVICE[code])}"
     return altered(solution_at_start(on, value, code), times=np.array([horizon]), message=message)
 
 
@@ -300,8 +302,7 @@ def _without_moving_target(problem: Problem) -> Problem:
     """The problem without its target if this depends on time, since it may be outside the box when checked."""
     if not problem.time_dependent or problem.target is None:
         return problem
-    names = ("cost", "controls", "disturbances", "noise", "discount", "terminal_cost", "stopping_cost", "running_max")
-    return Problem(problem.drift, **{name: getattr(problem, name) for name in names}, time_dependent=True)
+    return altered(problem, target=None, exit_cost=None)
 
 
 def _prepare(

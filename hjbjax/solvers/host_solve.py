@@ -102,7 +102,7 @@ def settled_on_host(
     if followed is not None:
         return followed, {}
     if reach is not None and not reach.surely.all():
-        warn_unreached(reach, undiscounted=bool(problem.discount == 0))
+        warn_unreached(reach, problem.payoff, undiscounted=bool(problem.discount == 0))
     reached = None if reach is None else reach.surely
     asked_again = sharpen and choices.levels and grid.size > COARSEST and not grid.sides("open")
     start, shapes = coarse_levels.first_guess(task, on.scheme, method, start, clock, asked_again=asked_again)

@@ -31,7 +31,7 @@ ADVICE = {
     Status.DIVERGED: "The value blows up: the worst disturbance reached its bound inside the box. Use a wider box of "
     "disturbances to see how fast; if the bound is part of the problem, pass inner=0.",
     Status.NONFINITE: "NaN or infinity appeared in the next step, and the last finite value is kept; check drift "
-    "and costs, or use a shorter step.",
+    "and cost, or use a shorter step.",
     Status.TIME_LIMIT: "Reached time_limit; raise it, or continue from the value so far with start=.",
     Status.INTERRUPTED: "The march was interrupted and the value so far is kept; continue from it with start=.",
     Status.STALLED: "The policy iteration of an implicit step did not converge; use a shorter step.",
@@ -384,7 +384,7 @@ def _message(task: March, front: Front, code: Status) -> str:
     t, horizon = float(front.t), float(task.horizon)
     if code is Status.CONVERGED:
         return f"Marched from t = {horizon:g} to t = {t:g}."
-    what = ADVICE.get(code, code.message)
+    what = task.problem.labels.word(ADVICE.get(code, code.message))
     # a march stalls for one of three reasons with different remedies: noise without a chain, unbounded rates, or a
     # policy iteration that did not converge, which ADVICE covers
     if code is Status.STALLED and int(front.seen.lacking) >= 0:

@@ -18,6 +18,7 @@ from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.isaacs import isaacs_gap
 from hjbjax.markov_chain import earnings, node_checks
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST, Labels
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.types import Field, Nodes, Scalar
 from hjbjax.solution import grid_error
@@ -55,7 +56,8 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     if not mute and code is Status.CONVERGED:
         warn_of_no_arrival(task, state)
     state = jax.device_get(state)
-    message = _message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid)
+    labels = task.problem.labels
+    message = _message(code, task, state, grid) if earning is None else _unbounded_message(earning, grid, labels)
     solution = _assemble(task, state, assumptions)
     lost = ~np.asarray(task.counted)
     arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
@@ -168,7 +170,7 @@ def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solutio
     policy, disturbance = (np.broadcast_to(nan, (*value.shape, m)) for m in inputs)
     return Solution(
         on.grid, value, policy, disturbance if problem.is_game else None, code=code,
-        message=code.message,
+        message=problem.labels.word(code.message),
         **question(problem),
         stats={
             "scheme": repr(on.scheme),
@@ -312,13 +314,15 @@ def _isaacs_gap(task: Task, state: State) -> float | None:
     return gap
 
 
-def _unbounded_message(earning: earnings.Earning, grid: Grid) -> str:
-    """The message for a value of −∞, with a place where a policy earns indefinitely."""
+def _unbounded_message(earning: earnings.Earning, grid: Grid, labels: Labels) -> str:
+    """The message for a value of −∞, or a reward of ∞, with a place where a policy earns indefinitely."""
     state = ", ".join(f"{x:.4g}" for x in grid.state(earning.node))
+    costs = labels.payoff == COST
+    infinite, mean, sign = ("−∞", earning.mean, "negative") if costs else ("∞", -earning.mean, "positive")
     return (
-        f"The value is −∞: without discount, a policy can stay indefinitely where its mean cost is {earning.mean:.3g} "
-        f"per unit time, for example near x = ({state}). Add a discount > 0, a horizon (march), or a running cost that "
-        "is not negative there."
+        f"The value is {infinite}: without discount, a policy can stay indefinitely where its mean {labels.payoff} is "
+        f"{mean:.3g} per unit time, for example near x = ({state}). Add a discount > 0, a horizon (march), or a "
+        f"running {labels.payoff} that is not {sign} there."
     )
 
 
@@ -339,12 +343,12 @@ def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
             f"{left:.3g} per unit time, divided by it overflows; use a larger discount, or 0 and a target."
         )
     if not np.any(bad):
-        return f"NaN or infinity appeared {when} and {kept}; check drift and cost."
+        return f"NaN or infinity appeared {when} and {kept}; check drift and {task.problem.payoff}."
     index = tuple(int(i) for i in np.unravel_index(int(np.argmax(bad)), bad.shape))
     x = ", ".join(f"{entry:.6g}" for entry in grid.state(index))
     return (
         f"NaN or infinity appeared {when} and {kept}: at {int(bad.sum())} of {bad.size} nodes, first at node {index}, "
-        f"x = [{x}]; check drift and cost there."
+        f"x = [{x}]; check drift and {task.problem.payoff} there."
     )
 
 
@@ -372,5 +376,8 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     if code is Status.CONVERGED and task.certificate in (Certificate.NONE, Certificate.OPEN):
         return f"Residual and last step are at most {tol:.2g}; no certificate bounds the error."
     if code is Status.CONVERGED and task.certificate is Certificate.RESIDUAL:
-        return f"Residual of the high-order equation and distance to its limit are at most {tol:.2g} in cost units."
-    return code.message
+        return (
+            f"Residual of the high-order equation and distance to its limit are at most {tol:.2g} in "
+            f"{task.problem.payoff} units."
+        )
+    return task.problem.labels.word(code.message)

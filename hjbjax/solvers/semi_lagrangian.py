@@ -23,6 +23,7 @@ from hjbjax.iteration.progress import HISTORY
 from hjbjax.markov_chain import memory, node_checks
 from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast
 from hjbjax.problem.sets import Finite
@@ -39,7 +40,7 @@ from hjbjax.solvers.stationary_run import StatesInChunks
 REPLACEMENT = SemiLagrangian()  # replaces the chain if this is carried past the target
 REASON = (
     "It was solved by SemiLagrangian(): the Markov chain of Upwind() and Limited() spreads by about a cell per step "
-    "and may be carried past the target, so its expected cost is infinite where the cost of the path is finite."
+    "and may be carried past the target, so its expected cost is not finite where the cost of the path is finite."
 )
 FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 WORDS = {
@@ -243,19 +244,21 @@ def _faults(links: Arcs, fixed: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _check_arcs(on: Discretisation, plan: Plan, links: Arcs, fixed: jax.Array) -> None:
     """Refuse arcs whose value is not finite, and without a discount arcs that cost nothing."""
+    word, costs = on.problem.labels.word, on.problem.payoff == COST
     broken, free = (np.asarray(found) for found in _faults(links, fixed))
     if broken.any():
         action = plan.actions[int(np.argmax(broken)) // len(plan.legs)]
         raise ValueError(
-            f"solve: on the arcs of the action {np.asarray(action).tolist()} drift, cost, target or exit_cost is NaN "
-            "or infinite between the nodes, where SemiLagrangian() evaluates them; define them in the whole box, or "
-            "use hjb.Upwind()"
+            f"solve: on the arcs of the action {np.asarray(action).tolist()} drift, {word('cost')}, target or "
+            f"{word('exit_cost')} is NaN or infinite between the nodes, where SemiLagrangian() evaluates them; define "
+            "them in the whole box, or use hjb.Upwind()"
         )
     if free.any():
         action = plan.actions[int(np.argmax(free)) // len(plan.legs)]
         raise ValueError(
-            "solve: SemiLagrangian() without discount requires a running cost that is positive off the target, or "
-            f"no bound on its error exists; the action {np.asarray(action).tolist()} costs nothing somewhere. "
+            f"solve: SemiLagrangian() without discount requires a running {word('cost')} that is "
+            f"{'positive' if costs else 'negative'} off the target, or no bound on its error exists; the action "
+            f"{np.asarray(action).tolist()} costs nothing somewhere. "
             "Add a discount > 0, or use hjb.Upwind()"
         )
 
@@ -277,14 +280,15 @@ def finish_arcs(followed: Followed) -> Solution:
     problem, looked, counted = on.problem, state.progress.has_begun, np.asarray(task.counted)
     state = jax.device_get(state)
     if reached is not None and not reached.all():
-        warn_unreached(Reach(reached, reached), undiscounted=task.certificate is not Certificate.ADDITIVE)
+        endless = task.certificate is not Certificate.ADDITIVE
+        warn_unreached(Reach(reached, reached), problem.payoff, undiscounted=endless)
     value = np.array(state.value if looked else task.obstacles.impose(jnp.asarray(state.value)))
     value[~counted] = np.inf
     policy = np.array(np.asarray(plan.actions)[state.number // len(plan.legs)])
     leaving = None if code in CUT or not looked else _leaving(on, value, policy, task)
     policy[~counted | np.asarray(task.obstacles.ended) | (not looked)] = np.nan
     best = float(state.progress.best[0])
-    message = within_reach(best) if code is Status.STALLED and np.isfinite(best) else code.message
+    message = within_reach(best) if code is Status.STALLED and np.isfinite(best) else problem.labels.word(code.message)
     solution = solution_at_start(on, value, code)
     solution = dataclasses.replace(
         solution, policy=policy, message=message, reached=reached, cut=leaving, steps=state.progress.steps,
@@ -299,7 +303,8 @@ def finish_replacement(followed: Followed) -> Solution:
     """The solution that replaces the chain's, with the reason in its message."""
     solution = finish_arcs(followed)
     solution.stats["method"] = f"PolicyIteration(), {followed.plan.count} arcs per node"
-    return dataclasses.replace(solution, message=f"{solution.message} {REASON}")
+    reason = followed.on.problem.labels.word(REASON)
+    return dataclasses.replace(solution, message=f"{solution.message} {reason}")
 
 
 def _said(solution: Solution, scheme: Scheme) -> Solution:

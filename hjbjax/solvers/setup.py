@@ -20,6 +20,7 @@ from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueItera
 from hjbjax.markov_chain import attainability, resting
 from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, known
 from hjbjax.problem.types import Mask, Number, Scalar
@@ -302,7 +303,7 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:
     reached = attainability.forced(task.on, held, least=_least_rate(task), clock=clock)
     if reached.all():
         return task, reached
-    warn_unreached(Reach(reached, reached), undiscounted=True)
+    warn_unreached(Reach(reached, reached), task.problem.payoff, undiscounted=True)
     return _finite_part(task, reached), reached
 
 
@@ -345,16 +346,17 @@ def is_carried_past(reach: Reach) -> bool:
     return bool(np.any(reach.maybe & ~reach.surely))
 
 
-def warn_unreached(reach: Reach, *, undiscounted: bool) -> None:
+def warn_unreached(reach: Reach, payoff: str, *, undiscounted: bool) -> None:
     """Warn of nodes from which the target is not reached, or not surely, and explain their value."""
     never, passed = (100 * float(np.mean(each)) for each in (~reach.maybe, reach.maybe & ~reach.surely))
-    what = "their value is inf" if undiscounted else "their value is the discounted cost of never arriving"
+    infinite = "inf" if payoff == COST else "-inf"
+    what = f"their value is {infinite}" if undiscounted else f"their value is the discounted {payoff} of never arriving"
     if not passed:
         warn(f"{never:.3g} % of the nodes cannot reach the target: {what}; see Solution.reached")
         return
     none = f"{never:.3g} % of the nodes cannot reach the target under any control, and " if never else ""
     warn(
         f"{none}from {passed:.3g} % of the nodes the Markov chain may be carried past the target under every control, "
-        f"so its expected cost is infinite: {what}; see Solution.reached. Without noise a path may still arrive from "
-        "there: use scheme=hjb.SemiLagrangian(), or a discount > 0"
+        f"so its expected {payoff} is {'' if payoff == COST else 'minus '}infinite: {what}; see Solution.reached. "
+        "Without noise a path may still arrive from there: use scheme=hjb.SemiLagrangian(), or a discount > 0"
     )

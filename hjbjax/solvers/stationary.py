@@ -26,6 +26,7 @@ from hjbjax.solution import checkpoints, nested_grids
 from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.placement import Path
+from hjbjax.solution.rewards import with_rewards
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, semi_lagrangian, transformed
@@ -40,6 +41,7 @@ from hjbjax.tracing.closures import with_settled_functions
 TRACED_STEPS = 10_000
 
 
+@with_rewards
 @with_settled_functions
 def solve(
     problem: Problem,
@@ -219,14 +221,18 @@ def check_arguments(
         check_method(method, "solve: method")
     if scheme is not None:
         schemes.check_scheme(scheme, "solve: scheme", grid, stationary=True)
-    arguments.positive(tol, "solve: tol", "in the units of the cost")
+    word = problem.labels.word
+    arguments.positive(tol, "solve: tol", word("in the units of the cost"))
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
         raise ValueError(
-            "solve: without discount a stopping_cost or a running_max has many fixed points, and the iteration must "
-            "start from the constraint itself;\nremove guess, and raise max_steps if necessary"
+            f"solve: without discount a {word('stopping_cost')} or a running_max has many fixed points, and the "
+            "iteration must start from the constraint itself;\nremove guess, and raise max_steps if necessary"
         )
-    if problem.terminal_cost is not None:
-        raise ValueError("solve: a terminal_cost belongs to a finite horizon; a stationary problem has none")
+    if problem.terminal_cost is not None or problem.terminal_reward is not None:
+        raise ValueError(
+            f"solve: a {word('terminal_cost')} belongs to a finite horizon; a stationary problem has none. "
+            "Use hjb.march(problem, grid, horizon)"
+        )
     if problem.time_dependent:
         raise ValueError("solve: a time-dependent problem has no stationary value; it needs a finite horizon")
 

@@ -121,11 +121,13 @@ def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
     ends = (problem.target, problem.stopping_cost, problem.running_max)
     if problem.discount > 0 or has_rest or any(end is not None for end in ends):
         return
+    word = problem.labels.word
     raise ValueError(
-        "Problem: there is no finite solution: discount = 0, and the cost accumulates forever: there is no target,\n"
-        "no stopping_cost, no running_max and no node where the system can rest at no cost.\n"
-        "Give discount > 0, or a target, or put a rest point (drift 0 and cost 0 for some control) on a node,\n"
-        "or march over a finite horizon" + _middle(grid)
+        f"Problem: there is no finite solution: discount = 0, and the {word('cost')} accumulates forever: there is no\n"
+        f"target, no {word('stopping_cost')}, no running_max and no node where the system can rest at no "
+        f"{word('cost')}.\n"
+        f"Give discount > 0, or a target, or put a rest point (drift 0 and {word('cost')} 0 for some control) on a\n"
+        "node, or march over a finite horizon" + _middle(grid)
     )
 
 
@@ -145,9 +147,10 @@ def _middle(grid: Grid) -> str:
 
 def call(problem: Problem, name: str) -> str:
     """A function with the arguments that the problem passes, as in ``drift(x, u)``."""
+    said = problem.labels.word(name)
     if not callable(getattr(problem, name)):
-        return name
-    return f"{name}({', '.join(_names(problem, name))})"
+        return said
+    return f"{said}({', '.join(_names(problem, name))})"
 
 
 def _names(problem: Problem, name: str) -> tuple[str, ...]:
@@ -320,7 +323,8 @@ def _check_arity(problem: Problem, name: str) -> None:
         players = "d because disturbances are given" if problem.is_game else "d only with disturbances"
         why = f"x and u always; {players}; {time}" if name in OF_ACTION else f"x always; {time}"
         raise ValueError(
-            f"{name} does not take the arguments that the problem passes, {call(problem, name)}: {error}.\nWhy: {why}"
+            f"{problem.labels.word(name)} does not take the arguments that the problem passes, {call(problem, name)}: "
+            f"{error}.\nWhy: {why}"
         ) from error
 
 

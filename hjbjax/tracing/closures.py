@@ -27,6 +27,7 @@ from jax.tree_util import Partial
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced
+from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import host_functions, jaxprs
@@ -120,6 +121,8 @@ def holds_tracers(thing: object, depth: int = 4) -> bool:
 def with_settled_functions(function: Callable) -> Callable:
     """Decorator of a function of (problem or problems, grid, ...): settles the problems and runs outside of traces.
 
+    Rewards become costs.
+
     A problem of known numbers inside a caller's ``jit`` is solved at once, like any other.
     """
 
@@ -151,11 +154,11 @@ def with_settled_functions(function: Callable) -> Callable:
 def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
     """A problem, or the problems in an iterable, settled; other things are left for the public function to refuse."""
     if isinstance(asked, Problem):
-        return settled(asked, n, dtype)
+        return settled(costs_of(asked), n, dtype)
     if not isinstance(asked, Iterable):
         return asked
     each = list(asked)  # only once, because it may be a generator
-    return [settled(one, n, dtype) if isinstance(one, Problem) else one for one in each]
+    return [settled(costs_of(one), n, dtype) if isinstance(one, Problem) else one for one in each]
 
 
 class Marked:

@@ -1,0 +1,140 @@
+"""Solutions in the sign of the rewards.
+
+The solvers minimise costs. ``with_rewards`` makes a public function accept problems with rewards: it negates the guess
+on the way in, and value, bounds and prescribed ends on the way out. The labels of a solution say whether its value is
+a cost or a reward, so functions that use a value, such as ``simulate``, take it with ``in_costs``.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import COST, REWARD
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered, is_traced
+from hjbjax.problem.rewards import costs_of, negative, negative_ends
+from hjbjax.solution.solution import Solution
+
+P = ParamSpec("P")
+T = TypeVar("T")
+GUESSES = ("guess", "start")  # arguments of the solvers that are values
+WORDS = {  # a bound of a value ≤ 0 has its factors in the other order
+    "running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)": "running reward, V/(1 − ρ) ≤ V_h ≤ V/(1 + η)",
+    "running cost": "running reward",
+}
+
+
+def in_costs(solution: Solution) -> Solution:
+    """The solution whose value is a cost: minus the value and the bounds of a solution with rewards."""
+    if solution.labels.payoff == COST:
+        return solution
+    problem = None if solution.problem is None else costs_of(solution.problem)
+    return _negative(solution, COST, solution.grid and negative_ends(solution.grid), problem)
+
+
+def in_rewards(solution: Solution, grid: Grid, problem: Problem | None = None) -> Solution:
+    """The solution whose value is a reward, on the user's grid, from a solver's solution."""
+    if solution.labels.payoff == REWARD:
+        return solution
+    known = None if is_traced(problem) else problem
+    found = _negative(solution, REWARD, negative_ends(solution.grid) if grid is None else grid, known)
+    if isinstance(sentence := found.stats.get("certificate"), str):
+        words = next(((old, new) for old, new in WORDS.items() if old in sentence), ("", ""))
+        found.stats["certificate"] = sentence.replace(*words)
+    return found
+
+
+def _negative(solution: Solution, payoff: str, grid: Grid, problem: Problem | None) -> Solution:
+    """The solution with minus its value, its bounds exchanged."""
+    enclosure = solution.enclosure
+    if enclosure is not None:  # −(factor · V + shift) = factor · (−V) − shift, and the bounds change places
+        xp: Any = jnp if is_traced(enclosure) else np
+        rows = xp.asarray(enclosure)[..., ::-1, :]
+        enclosure = xp.stack([rows[..., 0], 0 - rows[..., 1]], axis=-1)
+    value = solution.value if is_traced(solution.value) else np.asarray(solution.value)
+    labels = solution.labels._replace(payoff=payoff)
+    return altered(
+        solution, value=0 - value, enclosure=enclosure, labels=labels, grid=grid, problem=problem,
+        stats=dict(solution.stats),
+    )  # fmt: skip
+
+
+def with_rewards(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator of a public function of (problem or problems, grid, ...) that returns solutions of these problems.
+
+    Calls with costs only pass through unchanged.
+    """
+    parameters = inspect.signature(function)
+    first, second = list(parameters.parameters)[:2]
+
+    @functools.wraps(function)
+    def called(*arguments: P.args, **options: P.kwargs) -> Any:
+        asked: Any = arguments[0] if arguments else options.get(first)
+        if not isinstance(asked, Problem) and isinstance(asked, Iterable):
+            asked = list(asked)  # only once, because it may be a generator
+            arguments, options = ((asked, *arguments[1:]), options) if arguments else ((), {**options, first: asked})  # type: ignore[assignment]
+        problems = asked if isinstance(asked, list) else [asked]
+        rewarded = [isinstance(each, Problem) and each.payoff == REWARD for each in problems]
+        if not any(rewarded):
+            return function(*arguments, **options)
+        try:
+            given: dict[str, Any] = dict(parameters.bind(*arguments, **options).arguments)
+        except TypeError:
+            return function(*arguments, **options)  # refuses its arguments
+        grid = given[second]
+        if isinstance(grid, Grid):
+            _refuse_mixed_ends(function.__name__, grid, all_rewarded=all(rewarded))
+            given[second] = negative_ends(grid)
+        given |= {name: negative(_as_numbers(given[name])) for name in GUESSES if name in given}
+        try:
+            found: Any = function(**given)  # type: ignore[call-arg]
+        except BaseException as error:
+            _turn(error, problems, rewarded, grid)
+            raise
+        if isinstance(found, Solution):
+            return in_rewards(found, grid, asked)
+        return [_turned(*each, grid) for each in zip(found, problems, rewarded, strict=True)]
+
+    return called
+
+
+def _turned(solution: Solution, problem: Problem, rewarded: bool, grid: Grid) -> Solution:
+    """The solution of one of several problems in the sign of its payments."""
+    return in_rewards(solution, grid, problem) if rewarded else solution
+
+
+def _turn(error: BaseException, problems: list[Problem], rewarded: list[bool], grid: Grid) -> None:
+    """Give the partial solutions of an exception the sign of the rewards."""
+    reported: Any = error
+    solution, solutions = getattr(error, "solution", None), getattr(error, "solutions", ())
+    if solutions:
+        turned = tuple(_turned(*each, grid) for each in zip(solutions, problems, rewarded, strict=True))
+        reported.solution = next(new for old, new in zip(solutions, turned, strict=True) if old is solution)
+        reported.solutions = turned
+    elif isinstance(solution, Solution) and solution.problem is not None and solution.problem.payoff == REWARD:
+        reported.solution = in_rewards(solution, grid, problems[0] if len(problems) == 1 else solution.problem)
+
+
+def _as_numbers(values: Any) -> Any:
+    """A guess as an array if it is one; anything else is left for the solver to refuse."""
+    if values is None or is_traced(values):
+        return values
+    try:
+        array = np.asarray(values)
+        return array.astype(float) if array.dtype.kind == "u" else array
+    except ValueError:
+        return values
+
+
+def _refuse_mixed_ends(name: str, grid: Grid, *, all_rewarded: bool) -> None:
+    """Refuse prescribed values at the ends of the box that belong to costs and to rewards at the same time."""
+    if not all_rewarded and grid.prescribed("dirichlet", "neumann", "robin"):
+        raise ValueError(
+            f"{name}: got problems with costs and problems with rewards on a grid with prescribed ends, whose numbers "
+            "are costs or rewards;\nsolve the two kinds separately"
+        )

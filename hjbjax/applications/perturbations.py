@@ -23,7 +23,7 @@ from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Limited, check_slopes
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import front_door
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.problem.settings import own_settings
@@ -155,7 +155,7 @@ def perturbation_study(
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem already has noise or disturbances; remove them")
     # noise never lets the state rest, so the running cost continues indefinitely and only a discount makes it finite
-    if not np.asarray(problem.discount) > 0:
+    if not is_discounted(problem):
         raise ValueError("perturbation_study: without a discount the cost with noise is infinite; give a discount > 0")
     mask = mask_of(region, grid, "perturbation_study")
     # from the highest level, the weakest disturbance, so that effects increase as for the noises

@@ -16,6 +16,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
+from hjbjax.problem.time_change import in_own_time
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
@@ -119,7 +120,7 @@ def estimate(
       70
     """
     check_arguments(problem, grid, method, scheme, tol)
-    problem = costs_of(problem)  # resources do not depend on the sign
+    asked, problem = problem, in_own_time(costs_of(problem))  # memory does not depend on the sign
     kind, free = arguments.as_dtype(dtype), memory.available()
     check_on_one_state(problem, grid, scheme or Upwind())
     chosen = choose(problem, grid, traced=False, method=method)
@@ -140,7 +141,7 @@ def estimate(
             for small in tried:
                 alike = _alike(chosen, small, grid) if paths is None else method
                 options = {"scheme": scheme, "tol": tol, "dtype": kind, "throw": False, "progress": False}
-                found.append(solve(problem, small, method=alike, **options))
+                found.append(solve(asked, small, method=alike, **options))
         except ValueError as refusal:
             return dataclasses.replace(
                 about, note=f"on {memory.as_counts(small)} nodes: {str(refusal).splitlines()[0]}"

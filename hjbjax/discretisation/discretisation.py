@@ -255,6 +255,12 @@ class Discretisation:
         pairs = itertools.combinations_with_replacement(range(n), 2)
         return {(i, j): sum(p * q for p, q in zip(sigma[i], sigma[j], strict=True)) for i, j in pairs}
 
+    @property
+    def decay(self) -> Any:
+        """β in β V: the discount, a number, plus the killing at the nodes, (*grid), if there is any."""
+        killing = self.problem.killing
+        return self.problem.discount if killing is None else self.problem.discount + self.at_nodes(killing)
+
     def noisy_walls(self, x: list) -> list[dict[int, jax.Array]]:
         """The nodes where noise reflects, for every axis and the steps −1 and 1 across its walls: bool, one slice each.
 

@@ -28,6 +28,11 @@ def check_problem(problem: object, tol: float, max_nodes: int) -> None:
     ):
         if getattr(problem, name) is not None:
             raise ValueError(f"pontryagin: got a problem with {name}, wanted one without: {why}")
+    if callable(problem.discount):
+        raise ValueError(
+            "pontryagin: got a discount that is a function of the state, wanted a number; make ∫ discount dt a state z "
+            "with z(0) = 0, and multiply the costs by exp(−z)"
+        )
     if problem.controls is None:
         raise ValueError("pontryagin: got a problem without controls, wanted a Box, a Ball or a Finite to choose from")
     if not (np.ndim(tol) == 0 and 0 < tol < 1):

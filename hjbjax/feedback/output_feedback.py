@@ -188,6 +188,11 @@ def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
         what = "disturbances" if problem.is_game else "a running_max"
         fix = "use noise instead" if problem.is_game else "leave it out, and take the maximum along path.states"
         raise ValueError(f"simulate_output: got a problem with {what}, wanted one player and a running cost; {fix}")
+    if callable(problem.discount):
+        raise ValueError(
+            "simulate_output: got a discount that is a function of the state, wanted a number; make ∫ discount dt a "
+            "state z with z(0) = 0, and multiply the costs by exp(−z)"
+        )
     missing = [name for name in ("initial", "update", "estimate") if not callable(getattr(observer, name, None))]
     if missing:
         raise TypeError(

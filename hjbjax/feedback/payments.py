@@ -21,7 +21,7 @@ import numpy as np
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
@@ -138,7 +138,7 @@ def promise(feedback: object, start: Array, t: float = 0.0) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def still_ahead(problem: Problem, feedback: object, path: Path, *, to_horizon: bool) -> float | None:
+def still_ahead(problem: Problem, feedback: object, path: Path, weight: float, *, to_horizon: bool) -> float | None:
     """The cost that V predicts after the end of a short path, discounted to the start of the path.
 
     An undiscounted path that rests or circles outside the target never gets what V promised, so nothing is added. None
@@ -148,18 +148,23 @@ def still_ahead(problem: Problem, feedback: object, path: Path, *, to_horizon: b
       problem: the simulated problem.
       feedback: the feedback, with a Solution that holds V.
       path: NumPy arrays.
+      weight: the discount factor at the end of the path, e^{−∫ β dt}.
       to_horizon: True if the path is as long as the horizon of a march.
     """
     if path.status is PathStatus.TARGET or to_horizon:
         return 0.0
     if path.status is not PathStatus.DURATION:
         return None
-    solution, end, beta = solution_of(feedback), float(path.times[-1]), float(problem.discount)
+    solution, end = solution_of(feedback), float(path.times[-1])
     assert solution is not None
-    if beta == 0 and solution.times is None and (_rests(path, solution.grid) or _goes_round(path, solution)):
+    if (
+        is_discounted(problem) is False
+        and solution.times is None
+        and (_rests(path, solution.grid) or _goes_round(path, solution))
+    ):
         return 0.0
     value = promise(feedback, path.states[-1], end)
-    return None if value is None else math.exp(-beta * end) * value
+    return None if value is None else weight * value
 
 
 def _rests(path: Path, grid: Grid) -> bool:
@@ -190,7 +195,7 @@ def _comes_back(apart: np.ndarray, far: float, near: float) -> bool:
 
 
 def broken_promise(
-    problem: Problem, feedback: object, path: Path, *, to_horizon: bool, worst_case: bool = True
+    problem: Problem, feedback: object, path: Path, weight: float, *, to_horizon: bool, worst_case: bool = True
 ) -> str | None:
     """A sentence about a path whose cost differs from V by many times the estimated error; otherwise None.
 
@@ -198,6 +203,7 @@ def broken_promise(
       problem: the simulated problem.
       feedback: the feedback, with a Solution that holds V.
       path: NumPy arrays, with ``promised``.
+      weight: the discount factor at the end of the path, e^{−∫ β dt}.
       to_horizon: True if the path is as long as the horizon of a march.
       worst_case: True if the disturbance is the Solution's own; under another one the path may cost less.
     """
@@ -208,7 +214,7 @@ def broken_promise(
     states = path.states
     free = np.array(solution.grid.periodic)
     inside = (states >= solution.grid.lo) & (states <= solution.grid.hi) | free
-    ahead = still_ahead(problem, feedback, path, to_horizon=to_horizon)
+    ahead = still_ahead(problem, feedback, path, weight, to_horizon=to_horizon)
     if ahead is None or not np.all(inside[:-1]):
         return None
     total, promised = _combined(problem, float(path.cost), ahead), promise(feedback, states[0])

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
+from hjbjax.feedback.discounting import with_integral, without_integral
 from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop, check_shapes, noise_key, settled_loop, timeless
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
@@ -24,7 +25,7 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
 from hjbjax.solution.status import warn
-from hjbjax.tracing.closures import OF_ACTION, OF_STATE, holds_tracers, opened, settled
+from hjbjax.tracing.closures import OF_ACTION, OF_STATE, RATES, holds_tracers, opened, settled
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
 
@@ -112,6 +113,7 @@ def simulate(
         )
     if not isinstance(problem, Problem):
         raise TypeError(f"simulate: got {type(problem).__name__}, wanted a Problem, and then its feedback")
+    problem = costs_of(problem)
     duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
     due = _due(feedback, duration)
     if _is_traced(problem, feedback, disturbance, x0, key, grid, rtol, atol, max_step):
@@ -121,7 +123,6 @@ def simulate(
             problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=noise_key(problem, key), hold=held,
             rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, due=due, **options,
         )  # fmt: skip
-    problem = costs_of(problem)
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
     start = _initial_state(x0, loop.grid)
     loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
@@ -149,13 +150,16 @@ def simulate(
                 f"simulate: x0 = {start.tolist()} is outside the box from {lo} to {hi}, where the feedback is not "
                 "known; start inside, or pass clamp=True"
             )
-        path, active = _in_chunks(InitialValueProblem(loop, start, times, key), stepping, clock)
+        begun = InitialValueProblem(*with_integral(loop, start), times, key)
+        path, active = _in_chunks(begun, stepping, clock)
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
+        path, weights = without_integral(path, problem)
         path = dataclasses.replace(path, promised=_promised(problem, feedback, start), payoff=problem.payoff)
         path = truncate(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
         broken = broken_promise(
-            problem, feedback, path, to_horizon=due == "V at the horizon", worst_case=disturbance is None
-        )
+            problem, feedback, path, float(weights[len(path.times) - 1]),
+            to_horizon=due == "V at the horizon", worst_case=disturbance is None,
+        )  # fmt: skip
         if broken is not None:
             warn(f"simulate: {broken}")
         if clock.interrupted:
@@ -168,7 +172,7 @@ _margin = jax.jit(Loop.margin)
 
 def _is_traced(problem: object, *others: Any) -> bool:
     """True if some number is a tracer, including the numbers that functions close over."""
-    names = (*OF_ACTION, *OF_STATE)
+    names = (*OF_ACTION, *OF_STATE, *RATES)
     functions = [getattr(problem, name, None) for name in names] + [each for each in others if callable(each)]
     return is_traced(problem, *others) or any(map(holds_tracers, functions))
 
@@ -257,7 +261,8 @@ def rollout(
     loop = dataclasses.replace(loop, control=opened(loop.control, *moment), opponent=opened(loop.opponent, *moment))
     check_shapes(loop, start)
     stepping = Stepping(rtol, atol, np.inf if max_step is None else max_step, max_steps, hold)
-    path = integrate(InitialValueProblem(loop, start, jnp.asarray(times, start.dtype), key), stepping)[0]
+    begun = InitialValueProblem(*with_integral(loop, start), jnp.asarray(times, start.dtype), key)
+    path, _ = without_integral(integrate(begun, stepping)[0], problem)
     return dataclasses.replace(path, payoff=problem.payoff)
 
 

@@ -80,8 +80,8 @@ class FixedPoint:
     def residual(self, value: Field, actions: Actions, bound: jax.Array) -> Field:
         """Φ at a value with fixed branches; ``bound`` marks the nodes at which a constraint may be active."""
         on, obstacles = self.on, self.obstacles
-        rate = discrete.around(on, value, self.lost).at(*actions) + self.arriving - on.problem.discount * value
-        outflow = jax.lax.stop_gradient(jump_rates(on, *actions).total() + on.problem.discount)
+        rate = discrete.around(on, value, self.lost).at(*actions) + self.arriving - on.decay * value
+        outflow = jax.lax.stop_gradient(jump_rates(on, *actions).total() + on.decay)
         # divided like the equation, so that ∂Φ/∂V = −(I − W); the derivative of the divisor would be multiplied by r =
         # 0
         phi = jnp.where(obstacles.fixed, 0, rate) / jnp.where(outflow > 0, outflow, 1)
@@ -162,7 +162,7 @@ def _rests_unheld(question: FixedPoint, actions: Actions, value: Field) -> jax.A
     Leaving is equally good there, and the search may find either action first.
     """
     on, obstacles = jax.lax.stop_gradient((question.on, question.obstacles))
-    rests = (jump_rates(on, *actions).total() + on.problem.discount <= 0) & ~obstacles.fixed
+    rests = (jump_rates(on, *actions).total() + on.decay <= 0) & ~obstacles.fixed
     for constraint in (obstacles.upper, obstacles.lower):
         if constraint is not None:
             rests &= ~_is_constraint(value, constraint)

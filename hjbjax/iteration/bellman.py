@@ -143,7 +143,7 @@ def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -
     used, at best in a single pass over V.
     """
     hamiltonian = dataclasses.replace(discrete.around(on, value), bare=outflow is None)
-    players, discount = players_of(on), on.problem.discount
+    players, discount = players_of(on), on.decay
     outflow = fastest_rate(on) + discount if outflow is None else outflow
     if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
         best = optimum.optimal_value(hamiltonian)
@@ -160,7 +160,7 @@ def improvement(on: Discretisation, value: Field, fixed: jax.Array, new: Greedy,
     Keeping the old action on ties keeps a proper policy proper: the first action found leads to the node from which the
     value came, while an equally good one may lead into a cycle. There is no disturbance.
     """
-    hamiltonian, u, discount = _around(on, value, None), list(old.controls), on.problem.discount
+    hamiltonian, u, discount = _around(on, value, None), list(old.controls), on.decay
     rates = jump_rates(on, u, [])
     # H − β V is a sum of c V(x + o) − c V(x): terms of size (Q + β)|V|, each rounded
     rounding = ROUNDING * jnp.finfo(on.dtype).eps * (rates.total() + discount) * jnp.abs(value)
@@ -207,7 +207,7 @@ def _around(
 
 def _with_defect(on: Discretisation, value: Field, held: jax.Array, best: Field, u: Action, d: Action) -> Greedy:
     """The policy u, d with its defect r = H − β V, zero at fixed nodes; ``best`` is H."""
-    rate = jnp.where(held, 0, best - on.problem.discount * value)
+    rate = jnp.where(held, 0, best - on.decay * value)
     # broadcast actions that are one number for all nodes: the carry of a loop has fixed shapes
     full = [tuple(jnp.broadcast_to(jnp.asarray(c, on.dtype), on.grid.shape) for c in action) for action in (u, d)]
     return Greedy(rate, *full)
@@ -224,7 +224,7 @@ def policy_equation(
     """
     u, d = list(policy.controls), list(policy.disturbances)
     rates = jump_rates(on, u, d)
-    leaving = rates.total() + on.problem.discount
+    leaving = rates.total() + on.decay
     if every_rate:
         outflow = jnp.where(leaving > 0, leaving, 1)
     else:

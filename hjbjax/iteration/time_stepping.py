@@ -101,8 +101,9 @@ class March:
 
     def rate(self, value: Field, t: Number) -> tuple[Field, "Seen"]:
         """F = min max H − β V, cost per unit time, with the rates and the noise under the optimal actions."""
-        best, u, d = optimum.optimise(dataclasses.replace(discrete.around(self.on.at(t), value), bare=self.bare))
-        return best - self.problem.discount * value, self.look(value, u, d, t)
+        on = self.on.at(t)
+        best, u, d = optimum.optimise(dataclasses.replace(discrete.around(on, value), bare=self.bare))
+        return best - on.decay * value, self.look(value, u, d, t)
 
     def look(self, value: Field, u: Action, d: Action, t: Number) -> "Seen":
         """The largest Q + β under these actions, the first node whose noise has no chain, and the cut-off drift."""
@@ -112,7 +113,7 @@ class March:
             found = edges.count_leaving(on, value, u, d, self.obstacles_at(t).acting(value))
             seen = dataclasses.replace(seen, cut=found)
         if self.checks_rates:  # a pass over all rates, skipped if the limit of the step is known
-            fastest = on.grid.largest(jump_rates(on, u, d).total()) + jnp.asarray(on.problem.discount, dtype)
+            fastest = on.grid.largest(jump_rates(on, u, d).total()) + _largest_decay(on)
             seen = dataclasses.replace(seen, fastest=fastest)
         if self.checks_noise:
             lacking = correlated_noise.lacking(on, on.diffusion(u, d))
@@ -186,7 +187,13 @@ class Seen:
 
 def stable(on: Discretisation, tableau: Tableau = TABLEAUX[1], share: Numbers = 1.0) -> jax.Array:
     """The longest step at the time of ``on``, see ``longest_step``, of Euler's method by default."""
-    return longest_step(largest_rate(on) + on.problem.discount, on.problem, share, tableau)
+    return longest_step(largest_rate(on) + _largest_decay(on), on.problem, share, tableau)
+
+
+def _largest_decay(on: Discretisation) -> Scalar:
+    """The largest β, over the nodes if it is a function of the state."""
+    decay = jnp.asarray(on.decay, on.dtype)
+    return decay if on.problem.killing is None else on.grid.largest(decay)
 
 
 def terminal(on: Discretisation, start: Nodes | None = None) -> Field:

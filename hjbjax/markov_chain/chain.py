@@ -14,6 +14,7 @@ import numpy as np
 from hjbjax.discretisation import correlated_noise, edges, stencil
 from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Chain, Discretisation
+from hjbjax.discretisation.own_time import with_own_time
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import decision_process, stationary_law
@@ -141,6 +142,7 @@ def stationary_density(
     return density / np.sum(density * grid.volumes())
 
 
+@with_own_time
 @with_settled_functions
 def transition_arrays(
     problem: Problem, grid: Grid, *, scheme: Chain = Upwind()
@@ -159,6 +161,9 @@ def transition_arrays(
 
     QuantEcon maximises. ``DiscreteDP(rewards, probabilities, factor, state_index, action_index)`` has the value V_h of
     a problem with rewards, and with ``-costs`` it has the value −V_h of a problem with costs.
+
+    A discount that is a function β(x) of the state counts time by dτ = β(x) dt, in which the discount is one: drift,
+    noise and costs are divided by β, so that one factor serves all states.
 
     Args:
       problem: discounted, without disturbances or constraints, with K ``Finite`` controls, or None (K = 1).

@@ -54,7 +54,7 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
         clock.look()
         found = jax.device_get(_survey(on, actions))
     # values that are not finite first: comparisons with NaN are false, which would hide the cause
-    for name in (*OF_ACTION, "target", *STATE_COSTS):
+    for name in (*OF_ACTION, "target", *STATE_COSTS, "killing"):
         if name in found and found[name].nodes:
             _refuse_not_finite(problem, grid, name, found[name], actions)
     if "negative" in found and found["negative"].nodes:
@@ -137,7 +137,7 @@ def _state_fails(on: Discretisation) -> Verdict:
         inside = distance <= 0
         # a target that contains no node, or all nodes
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
-    for name in STATE_COSTS:
+    for name in (*STATE_COSTS, "killing"):
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
@@ -158,7 +158,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
         found["inside"] = jnp.sum(inside)
         # the least value shows how much too coarse the grid is, or how much too small the target
         found["nearest"] = (jnp.min(distance), jnp.argmin(distance))
-    for name in STATE_COSTS:
+    for name in (*STATE_COSTS, "killing"):
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True

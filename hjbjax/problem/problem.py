@@ -52,7 +52,9 @@ class Problem:
       disturbances: the admissible set of the opponent's d.
       noise: σ in dx = f dt + σ dw: a scalar ε (σ = ε I), an (n,) diagonal, an (n, k) matrix, or a function
         with the arguments of ``drift`` that returns one of these.
-      discount: β ≥ 0, per unit time.
+      discount: β ≥ 0, per unit time; or a function of the state, such as a mortality or a short rate. Then a path is
+        discounted by exp(−∫ β(x) dt). Without a horizon it must be positive everywhere; ``march`` takes any sign, and
+        functions of (t, x) if ``time_dependent``.
       target: a function that is ≤ 0 inside the target, where paths end.
       exit_cost: the cost paid on the target; a number or a function. Default: zero.
       terminal_cost: V at the horizon, for ``march``.
@@ -105,6 +107,8 @@ class Problem:
     stopping_reward: Any = None
     discounted: bool | None = dataclasses.field(init=False, default=None, repr=False)
     payoff: str = dataclasses.field(init=False, default=COST, repr=False)
+    # the part of the discount that is a function of the state, in the problem of a march; the other part is a number
+    killing: Any = dataclasses.field(init=False, default=None, repr=False)
 
     def __init__(
         self,
@@ -114,7 +118,7 @@ class Problem:
         *,
         disturbances: AdmissibleSet | None = None,
         noise: Callable | Numbers | Sequence | None = None,
-        discount: Number = 0.0,
+        discount: Callable | Number = 0.0,
         target: Callable | None = None,
         exit_cost: Callable | Number | None = None,
         terminal_cost: Callable | Number | None = None,
@@ -173,8 +177,9 @@ class Problem:
             "control_units": words.control_units,
             "inside": words.inside,
             # static, because ``jit`` hides numbers and the certificate must be chosen while compiling
-            "discounted": None if is_traced(discount) else bool(discount > 0),
+            "discounted": callable(discount) or (None if is_traced(discount) else bool(discount > 0)),
             "payoff": payoff,
+            "killing": None,
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -213,6 +218,8 @@ def is_discounted(problem: Problem) -> bool | None:
 
     A problem stores it in its structure, so it is known inside ``jit`` even if the number is traced.
     """
+    if callable(problem.discount):  # checked at the nodes
+        return True
     if is_traced(problem.discount):
         return problem.discounted
     return bool(np.all(np.asarray(problem.discount) > 0))  # a batch has one discount per problem: all must be positive
@@ -243,9 +250,9 @@ def _payment(paid: object, name: str) -> Any:
     return as_partial(paid, name) if name in ("Problem.cost", "Problem.reward") else _function_or_number(paid, name)  # type: ignore[arg-type]
 
 
-def _is_nonzero(discount: Number) -> bool:
-    """True if there is a discount; a traced one counts as nonzero."""
-    return is_traced(discount) or bool(discount != 0)
+def _is_nonzero(discount: Callable | Number) -> bool:
+    """True if there is a discount; a traced one and a function count as nonzero."""
+    return callable(discount) or is_traced(discount) or bool(discount != 0)
 
 
 def _check_sets(controls: object, disturbances: object) -> None:
@@ -258,11 +265,13 @@ def _check_sets(controls: object, disturbances: object) -> None:
             raise TypeError(f"Problem.{name}: got {admissible!r}, wanted a Box, a Ball, a Finite or None{cure}")
 
 
-def _rate(discount: object) -> Number:
-    """The discount as a float, or as a tracer."""
+def _rate(discount: object) -> Any:
+    """The discount as a float, as a tracer, or as a function."""
+    if callable(discount):
+        return as_partial(discount, "Problem.discount")
     rate = numbers(discount, "Problem.discount")
     if np.ndim(rate) != 0 or (isinstance(rate, np.ndarray) and not 0 <= rate < np.inf):
-        raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0")
+        raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0, or a function of the state")
     return float(rate) if isinstance(rate, np.ndarray) else rate
 
 

@@ -30,7 +30,7 @@ ELSEWHERE = {  # names of arguments in other packages and books, and the names u
     **dict.fromkeys(("utility", "profit", "payoff", "flow_payoff", "income", "return_function"), ("reward",)),
     **dict.fromkeys(("bequest", "scrap_value", "terminal_value", "terminal_utility"), ("terminal_reward",)),
     **dict.fromkeys(("exercise", "stopping_payoff", "stopping_value"), ("stopping_reward",)),
-    **dict.fromkeys(("gamma", "beta", "rho", "rate"), ("discount",)),
+    **dict.fromkeys(("gamma", "beta", "rho", "rate", "mortality", "hazard", "short_rate"), ("discount",)),
     **dict.fromkeys(("u", "action", "actions", "input", "inputs"), ("controls",)),
     **dict.fromkeys(("d", "adversary", "opponent"), ("disturbances",)),
     **dict.fromkeys(("sigma", "diffusion", "epsilon"), ("noise",)),

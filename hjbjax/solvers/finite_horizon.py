@@ -15,6 +15,7 @@ from jax.sharding import Mesh
 
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.own_time import with_killings
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
@@ -54,6 +55,7 @@ _obstacles = jax.jit(bellman.obstacles)
 
 
 @with_rewards
+@with_killings
 @with_settled_functions
 def march(
     problem: Problem,
@@ -332,8 +334,10 @@ def _prepare(
         found = time_probes.resolution(problem, grid, horizon, dtype)
         time_probes.warn_of_fast_changes(found, horizon, step)
         longest, left = (found.lengths[:, None], found.left) if step is None else (step, 0.0)
-    elif step is None and (looks[0] or not method.limited):
-        longest = horizon / FEWEST  # rates found during the march do not limit its first steps
+    elif step is None and (looks[0] or not method.limited or problem.killing is not None):
+        # rates found during the march do not limit its first steps, and only a discount that is a number is integrated
+        # exactly
+        longest = horizon / FEWEST
     obstacles = None if moving or not policy else _obstacles(on)
     return March(
         on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(longest, dtype),

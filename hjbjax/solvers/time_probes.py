@@ -27,6 +27,7 @@ from hjbjax.solution.status import warn
 PARTS = 100  # of the horizon, each at least one step
 CUTS = (1, 2, 4, 8, 16, 32, 64)  # numbers of steps per part
 PLACES = 6  # states, each with its own actions
+INTEGRATED = ("drift", "cost", "noise", "killing")  # the last is a function of the state
 INSIDE = 2  # samples inside the shortest steps, at random, since an oscillation could fit between regular samples
 INTEGRAL, LEVEL = 2e-3, 2e-2
 WARNS = 2e-2  # relative error of the integral with the shortest steps
@@ -64,7 +65,7 @@ def resolution(problem: Problem, grid: Grid, horizon: float, dtype: DType) -> Re
         values = np.asarray(seen, float)
         values = np.where(np.isfinite(values), values, 0.0)
         at_ends, between = values[: finest + 1], values[finest + 1 :].reshape(finest, INSIDE, *values.shape[1:])
-        if name in ("drift", "cost", "noise"):
+        if name in INTEGRATED:
             np.maximum(errors, _of_integral(at_ends, between, shares), out=errors)
         else:
             found_here, count = _of_level(at_ends, between)
@@ -111,8 +112,8 @@ def _places(problem: Problem, grid: Grid, random: np.random.Generator, dtype: DT
 @jax.jit
 def _sample(problem: Problem, x: Array, u: Array, d: Array, times: Array) -> dict[str, jax.Array]:
     """The problem's functions at all times and places, each of shape (times, places, entries)."""
-    acting = {name: getattr(problem, name) for name in ("drift", "cost", "noise")}
-    levels = {name: getattr(problem, name) for name in ("target", "stopping_cost", "running_max")}
+    acting = {name: getattr(problem, name) for name in INTEGRATED[:-1]}
+    levels = {name: getattr(problem, name) for name in (INTEGRATED[-1], "target", "stopping_cost", "running_max")}
 
     def at(t: Array, x: Array, u: Array, d: Array) -> dict[str, jax.Array]:
         action, state = problem.arguments(x, u, d, t), problem.state_arguments(x, t)

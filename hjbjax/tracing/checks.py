@@ -23,6 +23,7 @@ from hjbjax.tracing.operations import Operations, operations
 
 OF_ACTION = ("drift", "cost", "noise")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
+RATES = ("discount", "killing")
 
 _ADVICE = (  # most specific first, since TracerBoolConversionError is a ConcretizationTypeError
     (
@@ -102,7 +103,7 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
     with own_settings(x64=True):
         expect("drift", f"({n},)", lambda shape: shape == (n,))
         expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
-        for name in ("cost", "target", *STATE_COSTS):
+        for name in ("cost", "target", *STATE_COSTS, *RATES):
             expect(name, "()", lambda shape: shape == ())
 
 
@@ -147,7 +148,7 @@ def _middle(grid: Grid) -> str:
 
 def call(problem: Problem, name: str) -> str:
     """A function with the arguments that the problem passes, as in ``drift(x, u)``."""
-    said = problem.labels.word(name)
+    said = "discount" if name == "killing" else problem.labels.word(name)
     if not callable(getattr(problem, name)):
         return said
     return f"{said}({', '.join(_names(problem, name))})"
@@ -271,7 +272,7 @@ def problem_calls_back(problem: Problem, n: int) -> bool:
     """True if a function of a problem calls Python while it runs."""
     lengths = _lengths(problem, n)
     with own_settings(x64=True):
-        for name in (*OF_ACTION, "target", *STATE_COSTS):
+        for name in (*OF_ACTION, "target", *STATE_COSTS, *RATES):
             function, names = getattr(problem, name), _names(problem, name)
             if callable(function) and _trace_once(function, names, tuple(lengths[letter] for letter in names))[2]:
                 return True
@@ -282,7 +283,7 @@ def operations_of(problem: Problem, n: int) -> Operations:
     """The operations of one evaluation of all functions of a problem with ``n`` states, as written out for XLA."""
     lengths, total = _lengths(problem, n), Operations()
     with own_settings(x64=True):
-        for name in (*OF_ACTION, "target", *STATE_COSTS):
+        for name in (*OF_ACTION, "target", *STATE_COSTS, *RATES):
             function, names = getattr(problem, name), _names(problem, name)
             if callable(function):
                 total += _trace_once(function, names, tuple(lengths[letter] for letter in names))[3]

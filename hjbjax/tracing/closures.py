@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
 OF_ACTION = ("drift", "cost", "noise")
 OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max")
+RATES = ("discount", "killing")  # numbers, or functions of the state
 
 
 def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
@@ -60,7 +61,9 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
       n: the number of states.
       dtype: the floating-point type inside a JAX transformation. Default: JAX's default float there.
     """
-    functions = {name: getattr(problem, name) for name in (*OF_ACTION, *OF_STATE) if callable(getattr(problem, name))}
+    functions = {
+        name: getattr(problem, name) for name in (*OF_ACTION, *OF_STATE, *RATES) if callable(getattr(problem, name))
+    }
     if not is_traced(problem):
         known = {name: _settled_outside(each, _shapes(problem, name, n)) for name, each in functions.items()}
         if None not in known.values():
@@ -79,7 +82,8 @@ def digest(problem: Problem, n: int) -> str:
     account = hashlib.blake2b(digest_size=16)
     # outside of the caller's ``jit``, because only known numbers have a digest
     with jax.core.eval_context(), own_settings(x64=True):
-        for name in (*OF_ACTION, *OF_STATE):
+        rates = [name for name in RATES if callable(getattr(problem, name))]
+        for name in (*OF_ACTION, *OF_STATE, *rates):
             function = getattr(problem, name)
             account.update(f"{name} {type(function).__name__} ".encode())
             if callable(function):
@@ -109,7 +113,7 @@ def opened(function: Any, *arguments: jax.ShapeDtypeStruct) -> Any:
     return function if closed is None or not is_traced(closed.consts) else _with_closure_as_leaves(found, closed)
 
 
-def holds_tracers(thing: object, depth: int = 4) -> bool:
+def holds_tracers(thing: object, depth: int = 7) -> bool:
     """True if a function closes over a tracer, directly or through a function that it closes over."""
     if isinstance(thing, Partial):
         thing = thing.func

@@ -325,11 +325,12 @@ def _reading(function: Any, numbers: dict[str, Any]) -> Any:
     return changed
 
 
-def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 3) -> dict[str, np.ndarray]:
+def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 6) -> dict[str, np.ndarray]:
     """Numbers of these kinds, and real arrays, in the cells and globals that a function's own code names.
 
     Functions in its cells are included, as ``helper.name``: a drift may call a helper defined next to it. The functions
-    of ``Nested`` are called 0, 1, 2 and so on.
+    of ``Nested`` are called 0, 1, 2 and so on. Rewards and discounts of the state add up to three levels of the
+    package's own functions.
     """
     if isinstance(function, Nested):
         each_read = ((i, numbers_read(each, kinds, depth)) for i, each in _each(function))

@@ -1,0 +1,92 @@
+"""Loops whose discount is a function of the state: ∫ β dt along the path is one more state.
+
+With z = ∫ β(x(s)) ds the payments of the loop are e^{−z} times the payments of the problem, and nothing else is
+discounted. The integrator therefore only knows discounts that are numbers.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.feedback.loop import Loop
+from hjbjax.feedback.path import Path
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered, as_partial, pytree_dataclass
+from hjbjax.problem.types import Array, Number, State
+
+BEYOND = 1e30  # an end of the box that z never reaches
+PAYMENTS = ("cost", "exit_cost", "terminal_cost", "stopping_cost")
+
+
+@pytree_dataclass(static=("name",))
+class Weighted:
+    """A function of a problem as a function of the state (x, z)."""
+
+    problem: Problem
+    name: str
+
+    def __call__(self, *arguments: Any) -> Array:
+        """The value at the problem's arguments, with (x, z) in the place of x."""
+        problem, place = self.problem, int(self.problem.time_dependent)
+        x, z = arguments[place][:-1], arguments[place][-1]
+        own = (*arguments[:place], x, *arguments[place + 1 :])
+        if self.name == "drift":
+            rate = jnp.asarray(problem.discount(*own[: place + 1]), x.dtype)
+            return jnp.append(jnp.asarray(problem.drift(*own), x.dtype), rate)
+        if self.name == "noise":
+            t = own[0] if place else 0.0
+            sigma = problem.diffusion(x, own[place + 1], own[place + 2] if problem.is_game else None, t)
+            return jnp.pad(sigma, ((0, 1), (0, 0)))
+        ingredient = getattr(problem, self.name)
+        found = ingredient(*own) if callable(ingredient) else ingredient
+        return found if self.name == "target" else jnp.exp(-z) * jnp.asarray(found, x.dtype)
+
+
+def with_integral(loop: Loop, x0: Any) -> tuple[Loop, Any]:
+    """The loop and the start with z as their last state; unchanged if the discount is a number."""
+    problem = loop.problem
+    if not callable(problem.discount):
+        return loop, x0
+    names = ["drift", *(name for name in ("target", *PAYMENTS) if getattr(problem, name) is not None)]
+    changed: dict[str, Any] = {name: as_partial(Weighted(problem, name)) for name in names}
+    if callable(problem.noise):
+        changed["noise"] = as_partial(Weighted(problem, "noise"))
+    elif problem.noise is not None:  # a matrix keeps the higher order of the integrator for additive noise
+        changed["noise"] = jnp.pad(problem.diffusion(jnp.zeros(np.shape(x0)), None), ((0, 1), (0, 0)))
+    grid = loop.grid
+    if grid is not None:
+        lo, hi = jnp.append(jnp.asarray(grid.lo), -BEYOND), jnp.append(jnp.asarray(grid.hi), BEYOND)
+        grid = Grid(lo, hi, (*grid.shape, 2), (*grid.periodic, False))
+    seen = {name: _of_x(getattr(loop, name)) for name in ("control", "opponent", "surplus")}
+    last = None if loop.at_horizon is None else jax.tree_util.Partial(_weighted_look, as_partial(loop.at_horizon))
+    whole = altered(problem, discount=0.0, discounted=False, **changed)
+    longer = dataclasses.replace(loop, problem=whole, grid=grid, at_horizon=last, **seen)
+    xp: Any = np if isinstance(x0, np.ndarray) else jnp
+    return longer, xp.append(x0, xp.zeros((), x0.dtype))
+
+
+def without_integral(path: Path, problem: Problem) -> tuple[Path, Any]:
+    """The path without z, and e^{−∫ β dt} at every output time."""
+    if not callable(problem.discount):
+        times = path.times - path.times[0]
+        return path, np.exp(-np.asarray(problem.discount) * times) if isinstance(times, np.ndarray) else None
+    z = path.states[:, -1]
+    return dataclasses.replace(path, states=path.states[:, :-1]), np.exp(-z) if isinstance(z, np.ndarray) else None
+
+
+def _of_x(function: Callable | None) -> jax.tree_util.Partial | None:
+    """A function of (t, x) as a function of (t, (x, z))."""
+    return None if function is None else jax.tree_util.Partial(_look, as_partial(function))
+
+
+def _look(function: Callable, t: Number, y: State) -> Array:
+    return function(t, y[:-1])
+
+
+def _weighted_look(function: Callable, t: Number, y: State) -> Array:
+    return jnp.exp(-y[-1]) * function(t, y[:-1])

@@ -16,6 +16,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import in_unit_box
 from hjbjax.problem.time_change import in_own_time
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
@@ -120,7 +121,7 @@ def estimate(
       70
     """
     check_arguments(problem, grid, method, scheme, tol)
-    asked, problem = problem, in_own_time(costs_of(problem))  # memory does not depend on the sign
+    asked, problem = problem, in_own_time(in_unit_box(costs_of(problem), grid.ndim))  # memory does not depend on a sign
     kind, free = arguments.as_dtype(dtype), memory.available()
     check_on_one_state(problem, grid, scheme or Upwind())
     chosen = choose(problem, grid, traced=False, method=method)

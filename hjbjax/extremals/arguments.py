@@ -33,6 +33,10 @@ def check_problem(problem: object, tol: float, max_nodes: int) -> None:
             "pontryagin: got a discount that is a function of the state, wanted a number; make ∫ discount dt a state z "
             "with z(0) = 0, and multiply the costs by exp(−z)"
         )
+    if callable(problem.controls):
+        raise ValueError(
+            "pontryagin: got bounds of the controls that depend on the state, wanted a fixed set; solve it on a grid"
+        )
     if problem.controls is None:
         raise ValueError("pontryagin: got a problem without controls, wanted a Box, a Ball or a Finite to choose from")
     if not (np.ndim(tol) == 0 and 0 < tol < 1):

@@ -57,12 +57,12 @@ def with_integral(loop: Loop, x0: Any) -> tuple[Loop, Any]:
     if callable(problem.noise):
         changed["noise"] = as_partial(Weighted(problem, "noise"))
     elif problem.noise is not None:  # a matrix keeps the higher order of the integrator for additive noise
-        changed["noise"] = jnp.pad(problem.diffusion(jnp.zeros(np.shape(x0)), None), ((0, 1), (0, 0)))
+        changed["noise"] = jnp.pad(problem.diffusion(jnp.zeros(np.shape(x0)), jnp.zeros(0)), ((0, 1), (0, 0)))
     grid = loop.grid
     if grid is not None:
         lo, hi = jnp.append(jnp.asarray(grid.lo), -BEYOND), jnp.append(jnp.asarray(grid.hi), BEYOND)
         grid = Grid(lo, hi, (*grid.shape, 2), (*grid.periodic, False))
-    seen = {name: _of_x(getattr(loop, name)) for name in ("control", "opponent", "surplus")}
+    seen: dict[str, Any] = {name: _of_x(getattr(loop, name)) for name in ("control", "opponent", "surplus")}
     last = None if loop.at_horizon is None else jax.tree_util.Partial(_weighted_look, as_partial(loop.at_horizon))
     whole = altered(problem, discount=0.0, discounted=False, **changed)
     longer = dataclasses.replace(loop, problem=whole, grid=grid, at_horizon=last, **seen)

@@ -28,11 +28,12 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_jax, as_partial, cast, front_door, is_traced, pytree_dataclass
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import bounds_at, control_of, in_unit_box
 from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
 from hjbjax.solution.rewards import in_costs
 from hjbjax.solution.solution import Solution
-from hjbjax.tracing.closures import settled
+from hjbjax.tracing.closures import settled, settled_function
 
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
@@ -167,10 +168,12 @@ class GreedyFeedback:
     Args:
       problem: the problem whose Hamiltonian is minimised.
       solution: the solution whose value gives the slopes.
+      bounds: the function of the state that bounds the controls; None for a fixed set.
     """
 
     problem: Problem
     solution: Solution
+    bounds: Callable | None = None
 
     def __call__(self, *where: Place) -> Array:
         """The control, shape (m,); outside the grid the control of its nearest point."""
@@ -253,6 +256,10 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
         raise TypeError(f"greedy_feedback: got {type(problem).__name__}, wanted a Problem")
     if not isinstance(solution, Solution):
         raise TypeError(f"greedy_feedback: got {type(solution).__name__}, wanted a Solution")
+    bounds = problem.controls if callable(problem.controls) else None
+    if bounds is not None:
+        bounds = settled_function(bounds, *problem.state_arguments((solution.grid.ndim,), ()))
+    problem = in_unit_box(costs_of(problem), solution.grid.ndim)
     if problem.controls is None:
         raise ValueError("greedy_feedback: problem.controls is None, so that there is nothing to choose")
     wanted = (*np.shape(solution.times), *solution.grid.shape)
@@ -261,7 +268,7 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
     m = np.shape(solution.policy)[-1:] if solution.policy is not None else (problem.controls.dim,)
     if m != (problem.controls.dim,) or (problem.is_game and solution.disturbance is None):
         raise ValueError("greedy_feedback: the solution belongs to another problem; its players differ")
-    return GreedyFeedback(settled(costs_of(problem), solution.grid.ndim), in_costs(solution))
+    return GreedyFeedback(settled(problem, solution.grid.ndim), in_costs(solution), bounds)
 
 
 def _minimax(greedy: GreedyFeedback, where: tuple, costate: Array) -> tuple[Array, Array]:
@@ -324,6 +331,8 @@ def _at(greedy: GreedyFeedback, when: tuple[Number, ...], x: State, p: Costate) 
     _, u, d = optimise(hamiltonian)
     known = jnp.all(jnp.isfinite(p))  # otherwise minimising over NaN slopes would still return an admissible action
     control, disturbance = (jnp.where(known, _middle(action, x.dtype, n), jnp.nan) for action in (u, d))
+    if greedy.bounds is not None:
+        control = jnp.asarray(control_of(bounds_at(greedy.bounds, *problem.state_arguments(x, t)), control))
     return control, disturbance
 
 

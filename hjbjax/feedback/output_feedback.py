@@ -26,6 +26,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, cast, front_door, is_traced, numbers
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import Array, Key, Numbers
 from hjbjax.solution.status import warn
 from hjbjax.tracing import checks, closures
@@ -199,7 +200,7 @@ def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
             f"simulate_output: the observer is a {type(observer).__name__} without {' and '.join(missing)}, wanted an "
             "Observer, with initial(), update(state, u, dy, dt) and estimate(state)"
         )
-    problem = closures.settled(costs_of(problem), n)
+    problem = closures.settled(with_any_control(costs_of(problem), n), n)
     checks.of_one_state(problem, n, "the number of states in x0")
     return problem
 

@@ -22,6 +22,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import Key, Number, Numbers
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock, noting_interrupts
 from hjbjax.solution.status import warn
@@ -125,6 +126,7 @@ def simulate(
         )  # fmt: skip
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
     start = _initial_state(x0, loop.grid)
+    loop = dataclasses.replace(loop, problem=with_any_control(problem, start.size))
     loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
     hold = None if hold is False else hold
     times = _times(duration, steps, hold)
@@ -152,7 +154,7 @@ def simulate(
             )
         begun = InitialValueProblem(*with_integral(loop, start), times, key)
         path, active = _in_chunks(begun, stepping, clock)
-        path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, problem.controls))
+        path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, loop.problem.controls))
         path, weights = without_integral(path, problem)
         path = dataclasses.replace(path, promised=_promised(problem, feedback, start), payoff=problem.payoff)
         path = truncate(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
@@ -253,7 +255,7 @@ def rollout(
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
     key = noise_key(problem, key)
     # numbers that functions close over become leaves, because derivative rules only cover leaves
-    problem = settled(costs_of(problem), start.size, start.dtype)
+    problem = settled(with_any_control(costs_of(problem), start.size), start.size, start.dtype)
     if due is None:
         due = "V at the horizon" if _is_marched(feedback) else "terminal cost"
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)

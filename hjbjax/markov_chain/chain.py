@@ -14,7 +14,7 @@ import numpy as np
 from hjbjax.discretisation import correlated_noise, edges, stencil
 from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Chain, Discretisation
-from hjbjax.discretisation.own_time import with_own_time
+from hjbjax.discretisation.posing import without_horizon
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import decision_process, stationary_law
@@ -142,7 +142,7 @@ def stationary_density(
     return density / np.sum(density * grid.volumes())
 
 
-@with_own_time
+@without_horizon
 @with_settled_functions
 def transition_arrays(
     problem: Problem, grid: Grid, *, scheme: Chain = Upwind()

@@ -18,7 +18,7 @@ import numpy as np
 from hjbjax.problem import labels as labelling
 from hjbjax.problem.labels import COST, REWARD, Labels
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.problem.sets import AdmissibleSet, AnyControl, Ball, Box, Finite
 from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
 
 PAYMENTS = {  # the payments of a problem with rewards, and the same payments as costs
@@ -46,7 +46,8 @@ class Problem:
     Args:
       drift: f, returns shape (n,): the rate of change of the state.
       cost: L, returns a scalar: cost per unit time. Default: zero.
-      controls: the admissible set of u, shape (m,). ``None``: there is no control and u has shape (0,).
+      controls: the admissible set of u, shape (m,). ``None``: there is no control and u has shape (0,). A function of
+        the state that returns a ``Box`` bounds the controls by the state: ``lambda x: Box(lo(x), hi(x))``.
 
     Keyword Args:
       disturbances: the admissible set of the opponent's d.
@@ -87,7 +88,7 @@ class Problem:
 
     drift: jax.tree_util.Partial
     cost: Any = None
-    controls: AdmissibleSet | None = None
+    controls: Any = None
     disturbances: AdmissibleSet | None = None
     noise: Any = None
     discount: Any = 0.0
@@ -114,7 +115,7 @@ class Problem:
         self,
         drift: Callable,
         cost: Callable | None = None,
-        controls: AdmissibleSet | None = None,
+        controls: AdmissibleSet | Callable | None = None,
         *,
         disturbances: AdmissibleSet | None = None,
         noise: Callable | Numbers | Sequence | None = None,
@@ -137,7 +138,8 @@ class Problem:
         if not callable(drift):
             raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
         _check_sets(controls, disturbances)
-        words = labelling.checked(control_names, control_units, inside, 0 if controls is None else controls.dim)
+        count = 0 if controls is None else getattr(controls, "dim", None)  # unknown for a function of the state
+        words = labelling.checked(control_names, control_units, inside, count)
         # static: the order of min and max is part of a compiled program
         if isaacs not in ("upper", "lower"):
             raise ValueError(f"Problem.isaacs: got {isaacs!r}, wanted 'upper' (min max) or 'lower' (max min)")
@@ -165,7 +167,7 @@ class Problem:
         fields = {
             "drift": as_partial(drift, "Problem.drift"),
             **{name: _payment(paid, f"Problem.{name}") for name, paid in (costs | rewards).items()},
-            "controls": controls,
+            "controls": as_partial(controls, "Problem.controls") if callable(controls) else controls,
             "disturbances": disturbances,
             "noise": _noise(noise),
             "discount": discount,
@@ -258,7 +260,9 @@ def _is_nonzero(discount: Callable | Number) -> bool:
 def _check_sets(controls: object, disturbances: object) -> None:
     """Refuse sets of an unknown kind; a common mistake is to pass bounds without a ``Box``."""
     for name, admissible in (("controls", controls), ("disturbances", disturbances)):
-        if admissible is not None and not isinstance(admissible, (Box, Ball, Finite)):
+        if name == "controls" and callable(admissible):  # bounds that depend on the state
+            continue
+        if admissible is not None and not isinstance(admissible, (Box, Ball, Finite, AnyControl)):
             cure = ""
             if isinstance(admissible, (tuple, list)) and len(admissible) == 2:
                 cure = f": hjb.Box({admissible[0]!r}, {admissible[1]!r})"

@@ -138,6 +138,17 @@ class Finite:
         return np.shape(self.points)[-1]
 
 
+@pytree_dataclass(static=("dim",))
+class AnyControl:
+    """All of R^dim, for questions under a given control, in which no admissible set matters.
+
+    Args:
+      dim: the number of inputs m.
+    """
+
+    dim: int
+
+
 AdmissibleSet: TypeAlias = Box | Ball | Finite
 
 

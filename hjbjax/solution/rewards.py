@@ -81,7 +81,7 @@ def with_rewards(function: Callable[P, T]) -> Callable[P, T]:
         problems = asked if isinstance(asked, list) else [asked]
         rewarded = [isinstance(each, Problem) and each.payoff == REWARD for each in problems]
         if not any(rewarded):
-            return function(*arguments, **options)  # type: ignore[arg-type]
+            return function(*arguments, **options)
         try:
             given: dict[str, Any] = dict(parameters.bind(*arguments, **options).arguments)
         except TypeError:

@@ -45,10 +45,10 @@ def warn_of_no_arrival(task: Task, state: State) -> None:
     payoff, costs = task.problem.payoff, task.problem.payoff == COST
     share = 1 - float(np.mean(_arrive(on, state.policy.controls, start, most=most)))
     if share > SHARE:
-        most, price = (f"down to {best:.4g}", "positive") if costs else (f"up to {-best:.4g}", "negative")
+        bound, price = (f"down to {best:.4g}", "positive") if costs else (f"up to {-best:.4g}", "negative")
         warn(
             f"the feedback never arrives from about {share:.0%} of the nodes where V promises a reward on the target "
-            f"(V {most}): time costs nothing there, so resting indefinitely looks as good as arriving. "
+            f"(V {bound}): time costs nothing there, so resting indefinitely looks as good as arriving. "
             f"Give time a price: a discount > 0, or a {price} running {payoff}"
         )
 

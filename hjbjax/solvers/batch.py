@@ -26,7 +26,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
-from hjbjax.discretisation.own_time import with_own_time
+from hjbjax.discretisation.posing import without_horizon
 from hjbjax.discretisation.schemes import Upwind, check_slopes
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
@@ -70,7 +70,7 @@ from hjbjax.tracing.closures import with_settled_functions
 
 
 @with_rewards
-@with_own_time
+@without_horizon
 @with_settled_functions
 def solve_batch(
     problems: Iterable[Problem],

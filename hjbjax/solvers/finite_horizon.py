@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
-from hjbjax.discretisation.own_time import with_killings
+from hjbjax.discretisation.posing import with_horizon
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
@@ -55,7 +55,7 @@ _obstacles = jax.jit(bellman.obstacles)
 
 
 @with_rewards
-@with_killings
+@with_horizon
 @with_settled_functions
 def march(
     problem: Problem,

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
-from hjbjax.discretisation.own_time import with_own_time
+from hjbjax.discretisation.posing import without_horizon
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.methods import Method, check_method
 from hjbjax.markov_chain import memory
@@ -43,7 +43,7 @@ TRACED_STEPS = 10_000
 
 
 @with_rewards
-@with_own_time
+@without_horizon
 @with_settled_functions
 def solve(
     problem: Problem,

@@ -124,11 +124,10 @@ def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
         return
     word = problem.labels.word
     raise ValueError(
-        f"Problem: there is no finite solution: discount = 0, and the {word('cost')} accumulates forever: there is no\n"
-        f"target, no {word('stopping_cost')}, no running_max and no node where the system can rest at no "
-        f"{word('cost')}.\n"
-        f"Give discount > 0, or a target, or put a rest point (drift 0 and {word('cost')} 0 for some control) on a\n"
-        "node, or march over a finite horizon" + _middle(grid)
+        f"Problem: there is no finite solution: discount = 0, and the {word('cost')} accumulates forever: there is no "
+        f"target,\nno {word('stopping_cost')}, no running_max and no node where the system can rest at no "
+        f"{word('cost')}.\nGive discount > 0, or a target, or put a rest point (drift 0 and {word('cost')} 0 for some "
+        "control) on a node,\nor march over a finite horizon" + _middle(grid)
     )
 
 

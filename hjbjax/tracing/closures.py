@@ -29,6 +29,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import host_functions, jaxprs
 from hjbjax.tracing.outside import (
@@ -158,11 +159,11 @@ def with_settled_functions(function: Callable) -> Callable:
 def _settle_all(asked: object, n: int, dtype: DType | None) -> object:
     """A problem, or the problems in an iterable, settled; other things are left for the public function to refuse."""
     if isinstance(asked, Problem):
-        return settled(costs_of(asked), n, dtype)
+        return settled(with_any_control(costs_of(asked), n), n, dtype)
     if not isinstance(asked, Iterable):
         return asked
     each = list(asked)  # only once, because it may be a generator
-    return [settled(costs_of(one), n, dtype) if isinstance(one, Problem) else one for one in each]
+    return [settled(with_any_control(costs_of(one), n), n, dtype) if isinstance(one, Problem) else one for one in each]
 
 
 class Marked:
@@ -290,6 +291,11 @@ def _kind(leaf: jax.typing.ArrayLike | jax.ShapeDtypeStruct) -> tuple[tuple[int,
 
 def _shapes(problem: Problem, name: str, n: int) -> list[tuple[int, ...]]:
     """The shapes of the arguments of a problem's function."""
+    if callable(problem.controls):
+        raise ValueError(
+            "Problem.controls: got bounds that depend on the state, which this function does not take; wanted a fixed "
+            "set, such as hjb.Box, hjb.Ball or hjb.Finite"
+        )
     sizes = [0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances)]
     shapes = {"x": (n,), "u": (sizes[0],), "d": (sizes[1],), "t": ()}
     letters = problem.arguments("x", "u", "d", "t") if name in OF_ACTION else problem.state_arguments("x", "t")

@@ -1,0 +1,205 @@
+"""Ingredients that the solvers do not know, for public functions: bounds and discounts that are functions of the state.
+
+A decorated function receives problems with fixed sets and with discounts that are numbers. Its solutions get the
+controls and the problem of the user.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.schemes import Upwind
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered, cast, is_traced
+from hjbjax.problem.rewards import costs_of
+from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import bounds_at, control_of, in_unit_box, with_any_control
+from hjbjax.problem.time_change import in_own_time, with_killing
+from hjbjax.problem.types import Array, Scalar
+from hjbjax.solution.solution import Solution
+from hjbjax.tracing import checks
+from hjbjax.tracing.closures import holds_tracers, settled, settled_function
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def without_horizon(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator of a public function of (problem or problems, grid, ...) without a horizon.
+
+    Problems with a fixed set of controls, or none, and a discount that is a number pass through unchanged.
+    """
+    return _posing(function, _in_own_time)
+
+
+def with_horizon(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator of a public function of (problem, grid, horizon, ...); otherwise like ``without_horizon``."""
+    return _posing(function, _with_killing)
+
+
+def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str], Problem]) -> Callable[P, T]:
+    """A public function that receives problems that the solvers know."""
+    parameters = inspect.signature(function)
+    first, second = list(parameters.parameters)[:2]
+
+    @functools.wraps(function)
+    def called(*arguments: P.args, **options: P.kwargs) -> Any:
+        asked: Any = arguments[0] if arguments else options.get(first)
+        problems = [asked] if isinstance(asked, Problem) else asked if isinstance(asked, list) else []
+        if not any(map(_depends_on_state, problems)):
+            return function(*arguments, **options)
+        try:
+            given: dict[str, Any] = dict(parameters.bind(*arguments, **options).arguments)
+        except TypeError:
+            return function(*arguments, **options)  # refuses its arguments
+        grid = given[second]
+        if isinstance(grid, Grid):
+            made = [
+                discounting(_with_fixed_set(each, grid, function.__name__), grid, function.__name__)
+                if _depends_on_state(each)
+                else each
+                for each in problems
+            ]
+            given[first] = made[0] if isinstance(asked, Problem) else made
+        try:
+            found: Any = function(**given)  # type: ignore[call-arg]
+        except BaseException as error:
+            _restore(error, problems)
+            raise
+        if isinstance(found, list):
+            return [_of_user(*each) for each in zip(found, problems, strict=True)]
+        return _of_user(found, problems[0])
+
+    return called
+
+
+def _depends_on_state(problem: object) -> bool:
+    """True for a problem whose bounds or whose discount are functions of the state."""
+    return isinstance(problem, Problem) and (callable(problem.discount) or callable(problem.controls))
+
+
+def _of_user(found: Any, problem: Problem) -> Any:
+    """A solution with the controls and the problem of the user; other results unchanged."""
+    if not isinstance(found, Solution):
+        return found
+    changed: dict[str, Any] = {} if found.problem is None else {"problem": problem}
+    if callable(problem.controls) and found.policy is not None:
+        bounds = _bounds(problem, found.grid, found.times)
+        policy = control_of(bounds, found.policy)
+        changed["policy"] = policy.astype(found.policy.dtype)
+    return altered(found, **changed)
+
+
+def _restore(error: BaseException, problems: list[Problem]) -> None:
+    """Give the partial solutions of an exception the controls and the problems of the user."""
+    reported: Any = error
+    solution, solutions = getattr(error, "solution", None), getattr(error, "solutions", ())
+    if solutions:
+        restored = tuple(_of_user(*each) for each in zip(solutions, problems, strict=True))
+        reported.solution = next(new for old, new in zip(solutions, restored, strict=True) if old is solution)
+        reported.solutions = restored
+    elif isinstance(solution, Solution) and len(problems) == 1:
+        reported.solution = _of_user(solution, problems[0])
+
+
+# --- controls ---
+
+
+def _with_fixed_set(problem: Problem, grid: Grid, name: str) -> Problem:
+    """The problem with costs and a fixed set of controls, after a check of its functions and of its bounds."""
+    problem = costs_of(problem)
+    checks.of_one_state(with_any_control(problem, grid.ndim), grid.ndim, "the number of axes of the grid")
+    if not callable(problem.controls):
+        return problem
+    fixed = in_unit_box(problem, grid.ndim)
+    bounds = _bounds(problem, grid, None)
+    if not is_traced(bounds):  # otherwise the functions are NaN there, which the host refuses
+        faulty = np.any(~np.isfinite(bounds[0]) | ~np.isfinite(bounds[1]), axis=-1)
+        if faulty.any():
+            index = tuple(int(i) for i in np.argwhere(faulty)[0])
+            raise ValueError(
+                f"{name}: no admissible control at {int(faulty.sum())} nodes, the first x = "
+                f"{np.asarray(grid.state(index)).tolist()}: controls(x) is not a box with finite lo ≤ hi there;\n"
+                "use jnp.maximum(lo, hi) for hi, or a box where the bounds are ordered"
+            )
+    return fixed
+
+
+def _bounds(problem: Problem, grid: Grid, times: Any) -> tuple[Array, Array]:
+    """lo and hi at the nodes, (*grid, m), or at all kept times, (k, *grid, m); NumPy if all numbers are known."""
+    timed = problem.time_dependent
+    shapes = problem.state_arguments((grid.ndim,), ())
+    ready = settled_function(problem.controls, *shapes)
+    moments = (0.0 if times is None else times) if timed else None
+    if is_traced(ready, grid, times) or holds_tracers(problem.controls):
+        return _at_all(problem.controls, grid.nodes(), moments)
+    with jax.core.eval_context(), own_settings(x64=True):
+        known = cast((ready, np.asarray(grid.nodes()), moments), np.float64)
+        return jax.tree.map(np.asarray, _at_all_jit(*known))
+
+
+def _at_all(controls: Callable, nodes: Array, moments: Any) -> tuple[Array, Array]:
+    """The bounds at nodes (*grid, n), at one or several times if there are any."""
+    flat = jnp.reshape(nodes, (-1, nodes.shape[-1]))
+
+    def at_nodes(*t: Any) -> tuple[Array, Array]:
+        found = jax.vmap(lambda x: bounds_at(controls, *t, x))(flat)
+        return jax.tree.map(lambda bound: jnp.reshape(bound, (*nodes.shape[:-1], -1)), found)
+
+    if moments is None:
+        return at_nodes()
+    return jax.vmap(at_nodes)(moments) if jnp.ndim(moments) else at_nodes(moments)
+
+
+_at_all_jit = jax.jit(_at_all)
+
+
+# --- discounts ---
+
+
+def _in_own_time(problem: Problem, grid: Grid, name: str) -> Problem:
+    """The problem in its own time, after a check of β at the nodes."""
+    if not callable(problem.discount) or problem.time_dependent:  # a function of time is refused
+        return problem
+    _check_rate(problem, grid, name)
+    return in_own_time(problem)
+
+
+def _with_killing(problem: Problem, grid: Grid, name: str) -> Problem:
+    """The problem of a march, which checks its functions at the nodes."""
+    return with_killing(problem)
+
+
+def _check_rate(problem: Problem, grid: Grid, name: str) -> None:
+    """Refuse a discount that is not positive and finite at every node; host level."""
+    ready = settled(problem, grid.ndim)
+    if is_traced(ready, grid):  # the values are unknown; where β ≤ 0 the solution is NaN
+        return
+    with jax.core.eval_context(), own_settings(x64=True):
+        known = cast((ready, grid), np.float64)
+        least, where, faulty = jax.device_get(_least(Discretisation(*known, Upwind(), np.dtype(np.float64))))
+    if not faulty:
+        return
+    x = grid.state(tuple(int(i) for i in np.unravel_index(int(where), grid.shape)))
+    raise ValueError(
+        f"{name}: discount(x) is {least:.6g} at x = {np.asarray(x).tolist()}, the first of {int(faulty)} nodes where "
+        "it is not a positive number; wanted discount(x) > 0 everywhere:\n"
+        "without a horizon the discount bounds the value. Use jnp.maximum(discount, a small rate), or march over a "
+        "horizon"
+    )
+
+
+@jax.jit
+def _least(on: Discretisation) -> tuple[Scalar, Scalar, Scalar]:
+    """β at the first node where it is not positive and finite, the flat index of the node, and the number of nodes."""
+    rate = on.at_nodes(on.problem.discount)
+    faulty = ~((rate > 0) & (rate < jnp.inf))
+    where = jnp.argmax(faulty)
+    return rate.reshape(-1)[where], where, jnp.sum(faulty)

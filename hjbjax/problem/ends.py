@@ -1,7 +1,7 @@
 """Prescribed ends of the box: the value, the slope or the growth rate of V there.
 
 A ``Grid`` takes them in ``edges``, for one end at a time. Each is a number or a function of the state, which is
-evaluated at the nodes of that end when the grid is made. Slopes and rates are derivatives along the coordinate, not
+evaluated at the nodes of that end when the grid is made. Values have the sign of V: costs, or rewards. Slopes and rates are derivatives along the coordinate, not
 along the outward normal: if V increases, the slope is positive at both ends.
 """
 

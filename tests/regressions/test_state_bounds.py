@@ -67,6 +67,7 @@ def test_the_policy_is_the_users_and_the_bounds_are_reached_to_the_last_bit(solv
     assert hjb.estimate(problem, GRID, measure=False).fits
 
 
+@pytest.mark.slow
 def test_a_constant_box_as_a_function_is_the_box():
     given = (hjb.Box([-1.0], [1.0]), lambda x: hjb.Box([-1.0], [1.0]))
     fixed, free = (hjb.solve(hjb.Problem(steer, paid, each, discount=0.5), GRID, scheme=CHAIN) for each in given)

@@ -25,6 +25,7 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import front_door
+from hjbjax.problem.rewards import refuse_rewards
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Mask
@@ -151,6 +152,7 @@ def perturbation_study(
     """
     check_arguments(problem, grid, method, scheme, tol)
     check_slopes(scheme, "perturbation_study: scheme")
+    refuse_rewards(problem, "perturbation_study", "an L₂ gain is about the energy of an output, which is a cost")
     levels = _parameters("noises", noises), _parameters("gammas", gammas)
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem already has noise or disturbances; remove them")

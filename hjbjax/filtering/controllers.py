@@ -207,7 +207,8 @@ def averaged_hamiltonian(problem: Problem, solution: Solution, observer: GridFil
       observer: the filter; its grid may differ from the solution's grid, but must lie in the same box.
 
     Returns:
-      A pytree, called with the filter's state; ``.average(state, u)`` is the minimised average.
+      A pytree, called with the filter's state; ``.average(state, u)`` is the minimised average, in costs also for a
+      problem with rewards.
 
     Raises:
       TypeError: an argument that is not a Problem, a Solution or a GridFilter.

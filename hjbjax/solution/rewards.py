@@ -25,6 +25,7 @@ T = TypeVar("T")
 GUESSES = ("guess", "start")  # arguments of the solvers that are values
 WORDS = {  # a bound of a value ≤ 0 has its factors in the other order
     "running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)": "running reward, V/(1 − ρ) ≤ V_h ≤ V/(1 + η)",
+    "positive running cost": "negative running reward",
     "running cost": "running reward",
 }
 

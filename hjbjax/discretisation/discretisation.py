@@ -8,23 +8,19 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Parts
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.tracing import components, dependence
-
-T = TypeVar("T", bound=Any)
 
 
 class Scheme(abc.ABC):
@@ -126,7 +122,7 @@ class Chain(Scheme):
         """
 
 
-@pytree_dataclass(static=("scheme", "dtype", "mesh"))
+@pytree_dataclass(static=("scheme", "dtype"))
 class Discretisation:
     """A problem on a grid, discretised by a scheme, in one floating-point type and at one time.
 
@@ -140,7 +136,6 @@ class Discretisation:
       dtype: the floating-point type of all node values.
       t: the time, used if the problem depends on it.
       cut: the links that end on the boundary of a target, stored by ``cut_cells.kept``; None: computed on use.
-      mesh: the devices over which the nodes are divided during the iteration; None: one device.
     """
 
     problem: Problem
@@ -149,7 +144,6 @@ class Discretisation:
     dtype: Any
     t: Any = 0.0
     cut: tuple[Links, ...] | None = None
-    mesh: Mesh | None = None
 
     def __post_init__(self) -> None:
         # jnp.float32 and "float32" hash differently from np.dtype, so each would compile its own program
@@ -177,12 +171,6 @@ class Discretisation:
     def settled(self) -> "Discretisation":
         """The discretisation for a program in which the grid is constant, see ``Grid.settled``."""
         return altered(self, grid=self.grid.settled())
-
-    @property
-    def parts(self) -> Parts | None:
-        """The parts of the grid over the mesh; None for one device, and for grids too small to divide."""
-        parts = None if self.mesh is None else Parts(self.mesh, self.grid.shape)
-        return parts if parts is not None and parts.fits else None
 
     def coordinates(self) -> list:
         """The n coordinates of all nodes, each of a shape that broadcasts to (*grid)."""
@@ -271,23 +259,6 @@ class Discretisation:
 
     def _arguments(self, u: list, d: list | None, x: list | None) -> tuple:
         return self.problem.arguments(self.coordinates() if x is None else x, u, d, self.t)
-
-
-def over_nodes(task: T, shape: tuple[int, ...]) -> T:
-    """Mark the leaves of a task, or of a march, that have a value at every node, that is, have this ``shape``."""
-
-    def mark(leaf: Any) -> bool:
-        return np.shape(leaf) == shape
-
-    on = task.on
-    # except the leaves of the problem and the grid, which may have this shape by chance
-    nothing, cut = jax.tree.map(lambda _: False, on), jax.tree.map(mark, on.cut)
-    return altered(jax.tree.map(mark, altered(task, on=None)), on=altered(nothing, cut=cut))
-
-
-def on_part(task: T, parts: Parts) -> T:
-    """A task, or a march, on the part of one device, inside ``shard_map``."""
-    return altered(task, on=altered(task.on, grid=task.on.grid.divided(parts)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -148,13 +148,13 @@ def largest_rate(on: Discretisation) -> jax.Array:
         itertools.product(*(sets.probes(each, on.dtype) for each in (on.problem.controls, on.problem.disturbances)))
     )
     if on.apart or len(pairs) == 1:
-        return on.grid.largest(fastest_rate(on))
+        return on.grid.layout.largest(fastest_rate(on))
     us, ds = ([jnp.stack(list(entries)) for entries in zip(*each, strict=True)] for each in zip(*pairs, strict=True))
 
     def larger(k: Any, largest: jax.Array) -> jax.Array:
         # one action at a time: for all at once XLA keeps common terms, 17 arrays for a quadrotor in six dimensions
         u, d = ([entry[k] for entry in entries] for entries in (us, ds))
-        return jnp.maximum(largest, on.grid.largest(jump_rates(on, u, d).total()))
+        return jnp.maximum(largest, on.grid.layout.largest(jump_rates(on, u, d).total()))
 
     return jax.lax.fori_loop(0, len(pairs), larger, jnp.zeros((), on.dtype))
 

@@ -264,7 +264,7 @@ class Limited(Scheme):
 
 def _is_plain(grid: Grid, axis: int) -> bool:
     """True if an axis has equal spacings and at least three nodes, and is not divided among devices."""
-    return grid.stretch[axis] is None and grid.shape[axis] > 2 and not grid.is_divided(axis)
+    return grid.stretch[axis] is None and grid.shape[axis] > 2 and not grid.layout.is_divided(axis)
 
 
 def calm(on: Discretisation, x: list, links: Sequence[Links]) -> list:

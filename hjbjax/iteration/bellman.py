@@ -224,7 +224,7 @@ def policy_equation(
     u, d = list(policy.controls), list(policy.disturbances)
     rates = jump_rates(on, u, d)
     leaving = rates.total() + on.problem.discount
-    fastest = on.grid.largest(leaving) if fastest is None else fastest
+    fastest = on.grid.layout.largest(leaving) if fastest is None else fastest
     moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
     outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost accumulates
     # s, then min(s, ψ − V), then max(·, g − V); a row whose branch is a constraint reads δ = source
@@ -265,4 +265,4 @@ def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) 
         leaking = leaking + leak  # rates per unit time, (*grid): several small leaks add up
     # relative to all rates of the node, since terms of the drift may cancel up to their rounding
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()
-    return grid.some(~lost & ~held & (leaking > limit))
+    return grid.layout.some(~lost & ~held & (leaking > limit))

@@ -22,6 +22,7 @@ either decreased. They determine its status.
 
 import dataclasses
 import enum
+import math
 from typing import Any, TypeVar
 
 import jax
@@ -31,7 +32,8 @@ import numpy as np
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import undivided
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
 from hjbjax.solution.status import Status
@@ -105,7 +107,7 @@ class Iterate:
     """A value function with its policy and the residual of its equation.
 
     Attributes:
-      grid: the grid.
+      layout: the layout of the nodes.
       value: V, (*grid).
       policy: the greedy policy at V with its defect r, zero at fixed nodes.
       equation: its correction equation, whose source is the residual.
@@ -113,7 +115,7 @@ class Iterate:
       counted: bool (*grid), the nodes whose error counts (those that reach the target).
     """
 
-    grid: Grid
+    layout: Layout
     value: Field
     policy: Greedy
     equation: PolicyEquation
@@ -145,7 +147,7 @@ def error_bound(
             endless = jnp.full_like(without.residual, jnp.inf)
             without = dataclasses.replace(without, above=endless, lift=endless)
         return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
-    residual = iterate.grid.largest(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
+    residual = iterate.layout.largest(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
     if kind is Certificate.ADDITIVE:
         below, above = _additive(iterate, discount)
         error = jnp.maximum(jnp.abs(below), jnp.abs(above))
@@ -173,18 +175,18 @@ def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[
     zero = jnp.zeros((), value.dtype)
     if kind is Certificate.ADDITIVE:
         defect = jax.lax.optimization_barrier(defect)
-        error = on.grid.largest(jnp.abs(given.clipped(defect / on.problem.discount, value)))
+        error = on.grid.layout.largest(jnp.abs(given.clipped(defect / on.problem.discount, value)))
         return given.clipped(defect / outflow, value), ErrorBound(-error, error, zero, error, error)
     step = given.clipped(jax.lax.optimization_barrier(defect / outflow), value)
-    residual = on.grid.largest(jnp.abs(step))
+    residual = on.grid.layout.largest(jnp.abs(step))
     return step, ErrorBound(zero, zero, zero, residual, residual)
 
 
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
     """The minimum and maximum of ρ = max(min(r/β, ψ − V), g − V)."""
-    grid, value, policy, obstacles = iterate.grid, iterate.value, iterate.policy, iterate.obstacles
+    layout, value, policy, obstacles = iterate.layout, iterate.value, iterate.policy, iterate.obstacles
     if obstacles.upper is None and obstacles.lower is None:  # reductions first, without an array r/β
-        return grid.least(policy.defect) / discount, grid.largest(policy.defect) / discount
+        return layout.least(policy.defect) / discount, layout.largest(policy.defect) / discount
     shift = policy.defect / discount
     if obstacles.upper is not None:
         shift = jnp.minimum(shift, obstacles.upper - value)
@@ -192,13 +194,13 @@ def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
         shift = jnp.maximum(shift, obstacles.lower - value)
     # at fixed nodes r is zero, the constraints need not be; V is exact there
     shift = jnp.where(obstacles.fixed, 0, shift)
-    return grid.least(shift), grid.largest(shift)
+    return layout.least(shift), layout.largest(shift)
 
 
 def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> ErrorBound:
     """V/(1 + η) ≤ V_h ≤ V/(1 − ρ) for V shifted so that no exit cost is negative."""
     value, policy, obstacles, counted = iterate.value, iterate.policy, iterate.obstacles, iterate.counted
-    grid, costs = iterate.grid, least_cost > 0
+    layout, costs = iterate.layout, least_cost > 0
     free = counted & ~obstacles.fixed
     # where L = 0 any defect is infinite relative to the cost; r = 0 gives NaN from sign · ∞, but ``priced`` is false
     # then anyway
@@ -206,14 +208,14 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     relative = jnp.where(free, rate, 0)
     # where V = ψ only ψ, which is imposed, bounds V_h from above
     rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
-    rho, eta = jnp.maximum(grid.largest(rising), 0), jnp.maximum(grid.largest(-relative), 0)
+    rho, eta = jnp.maximum(layout.largest(rising), 0), jnp.maximum(layout.largest(-relative), 0)
     # as numbers: for booleans XLA would make two passes
-    priced = grid.largest(jnp.asarray(free & ~costs, value.dtype)) == 0
+    priced = layout.largest(jnp.asarray(free & ~costs, value.dtype)) == 0
     sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # where V is flat, r = L up to rounding
     below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
-    lift = jnp.maximum(-lowest_end(obstacles, counted, grid), 0)
+    lift = jnp.maximum(-lowest_end(obstacles, counted, layout), 0)
     apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # avoids 0 · inf
-    least, most = (grid.least(jnp.where(counted, value, jnp.inf)), grid.largest(jnp.where(counted, value, -jnp.inf)))
+    least, most = layout.least(jnp.where(counted, value, jnp.inf)), layout.largest(jnp.where(counted, value, -jnp.inf))
     # the scaling argument requires V ≥ 0; otherwise there is no bound
     bounded = jnp.isfinite(above) & (least + lift >= 0)
     error = jnp.where(bounded, jnp.maximum(most + lift, 0) * apart, jnp.inf) + 0 * residual  # keeps NaN
@@ -252,14 +254,14 @@ def widen_bounds(
     return dataclasses.replace(bound, below=below, above=above)
 
 
-def lowest_end(obstacles: Obstacles, counted: Mask | bool, grid: Grid) -> Scalar:
+def lowest_end(obstacles: Obstacles, counted: Mask | bool, layout: Layout) -> Scalar:
     """The least payment at the end of a run, at most zero: exit costs, also between nodes, and ψ."""
-    lowest = grid.least(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0))
+    lowest = layout.least(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0))
     lowest = jnp.minimum(lowest, obstacles.least_exit)
     # ψ is paid on stopping, which is possible anywhere
-    return (
-        lowest if obstacles.upper is None else jnp.minimum(lowest, grid.least(jnp.where(counted, obstacles.upper, 0)))
-    )
+    if obstacles.upper is None:
+        return lowest
+    return jnp.minimum(lowest, layout.least(jnp.where(counted, obstacles.upper, 0)))
 
 
 def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = None) -> Any:
@@ -310,17 +312,17 @@ def moves_after(state: Any, moved: Scalar, turned: jax.Array) -> Moves:
     return jax.tree.map(lambda after, before: jnp.where(state.step < 0, before, after), new, old)
 
 
-def turns_back(grid: Grid, change: Field, defect: Field) -> jax.Array:
+def turns_back(layout: Layout, change: Field, defect: Field) -> jax.Array:
     """True if a correction overshot: where V changed most, its equation now requires the opposite change.
 
     Args:
-      grid: the grid.
+      layout: the layout of the nodes.
       change: the last change of V, zero at nodes that do not count, cost units, (*grid).
       defect: the residual at the new V, positive where V should increase, cost per unit time, (*grid).
     """
-    most = jnp.abs(change) > grid.largest(jnp.abs(change)) / 2
+    most = jnp.abs(change) > layout.largest(jnp.abs(change)) / 2
     onwards = jnp.where(most, jnp.sign(change) * defect, 0)
-    return grid.largest(-onwards) > grid.largest(onwards)
+    return layout.largest(-onwards) > layout.largest(onwards)
 
 
 def distance(task: Any, moves: Moves, moved: Scalar, value: Field) -> Scalar:
@@ -339,24 +341,24 @@ def distance(task: Any, moves: Moves, moved: Scalar, value: Field) -> Scalar:
     rate = jnp.where(jnp.isfinite(before[0]), jnp.max(ratios), SLOWEST)
     rate = jnp.clip(rate, 0, SLOWEST)
     # steps of the size of rounding do not contract and do not count
-    rounding = FEW * jnp.finfo(value.dtype).eps * _size(task.grid, value, task.counting)
+    rounding = FEW * jnp.finfo(value.dtype).eps * _size(task.layout, value, task.counting)
     return moved + jnp.maximum(moved - rounding, 0) * rate / (1 - rate)
 
 
 def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
     """The status of a ``fixed_point.Task`` after a step; later lines override earlier ones."""
-    longest = task.method.patience(task.grid.whole)
+    longest = task.method.patience(undivided(task.grid))
     climbs = task.constrained or task.method.relaxes
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     if to_the_end:  # a front moves V at every node by the spacing times the slope, one step after the other
-        longest = jnp.maximum(longest, 100 + 4 * task.grid.whole.size)
+        longest = jnp.maximum(longest, 100 + 4 * math.prod(task.layout.whole))
 
     def converged(code: Any, tol: Scalar) -> Scalar:
         code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
         return jnp.where(jnp.isfinite(bound.residual), code, Status.NONFINITE).astype(jnp.int32)
 
     def by_size() -> Scalar:
-        rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * _size(task.grid, value, task.counting), task.tol
+        rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * _size(task.layout, value, task.counting), task.tol
         if to_the_end:  # regardless of the tolerance
             tol = jnp.where(task.problem.discount > 0, tol, FEW / ROUNDING * rounding if task.bare else rounding)
         # a residual that is rounding cannot fall further: ten steps suffice, instead of thousands for a slow climb
@@ -388,11 +390,11 @@ def tube_status(task: Any, state: Any, moved: Scalar, code: Scalar) -> Scalar:
     return jnp.where(ends, int(Status.CONVERGED), code).astype(code.dtype)
 
 
-def _size(grid: Grid, value: Field, counted: Mask | bool) -> Scalar:
+def _size(layout: Layout, value: Field, counted: Mask | bool) -> Scalar:
     """max |V| over the counted nodes."""
     if not jnp.ndim(counted):  # all nodes count: no array of |V|
-        return jnp.maximum(grid.largest(value), -grid.least(value))
-    return grid.largest(jnp.where(counted, jnp.abs(value), 0))
+        return jnp.maximum(layout.largest(value), -layout.least(value))
+    return layout.largest(jnp.where(counted, jnp.abs(value), 0))
 
 
 def booked(state: S, start: Scalar, bound: ErrorBound, code: Scalar, since: Scalar, **found: Any) -> S:

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import Rates, jump_rates
@@ -23,6 +24,7 @@ from hjbjax.iteration import bellman, certificates, methods
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
 from hjbjax.iteration.evaluation import Evaluation, evaluate
+from hjbjax.iteration.grid_task import GridTask
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_constrained
@@ -33,8 +35,8 @@ from hjbjax.solution.status import Status
 HISTORY = 256  # largest number of steps per chunk, whose residuals are recorded
 
 
-@pytree_dataclass(static=("certificate", "has_lost", "bare"))
-class Task:
+@pytree_dataclass(static=("certificate", "has_lost", "bare", "mesh"))
+class Task(GridTask):
     """The constants of a solve: the problem on its grid, the method, and the error bound.
 
     Args:
@@ -53,6 +55,7 @@ class Task:
         serves both; None: always the scheme itself. Only without noise.
       floor: a lower bound on all values, cost units, for a high-order scheme; None if there is none.
       shift: an addition to the discount in high-order corrections, per unit time; None: nothing.
+      mesh: the devices over which the nodes are divided during the iteration; None: one device.
     """
 
     on: Discretisation
@@ -69,16 +72,7 @@ class Task:
     first_order: Any = None
     floor: Any = None
     shift: Any = None
-
-    @property
-    def problem(self) -> Problem:
-        """The problem."""
-        return self.on.problem
-
-    @property
-    def grid(self) -> Grid:
-        """The grid."""
-        return self.on.grid
+    mesh: Mesh | None = None
 
     @property
     def scheme(self) -> Scheme:
@@ -135,7 +129,7 @@ class Task:
         if not self.has_lost:
             return value
         # 1/√eps above: no minimum selects it, and a difference with it still has half of its digits
-        largest = self.grid.largest(jnp.where(self.counted, jnp.abs(value), 0))
+        largest = self.layout.largest(jnp.where(self.counted, jnp.abs(value), 0))
         return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
 
     def equation(self, value: Field, policy: Greedy, fastest: Scalar | None = None) -> PolicyEquation:
@@ -152,7 +146,7 @@ class Task:
 
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source| at the counted nodes, in cost units."""
-        return self.grid.largest(jnp.where(self.counting, jnp.abs(equation.source), 0))
+        return self.layout.largest(jnp.where(self.counting, jnp.abs(equation.source), 0))
 
     def start(self) -> Field:
         """The value without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
@@ -188,7 +182,7 @@ def begin(task: Task, guess: Nodes) -> State:
     traced, dtype = is_traced(task, guess), guess.dtype
     xp: Any = jnp if traced else np
     copied: Any = jnp.array if traced else functools.partial(jax.device_put, may_alias=False)
-    value: Any = copied(guess) if task.on.parts is None else guess
+    value: Any = copied(guess) if task.parts is None else guess
     shape = () if task.bare else task.grid.shape  # of the policy
     players = (None if task.bare else admissible for admissible in (task.problem.controls, task.problem.disturbances))
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
@@ -229,7 +223,7 @@ def _advance(task: Task, state: State, start: Scalar) -> State:
     value = task.impose(state.value + delta)
     # a node that does not count may change indefinitely
     change = jnp.where(task.counting, value - state.value, 0)
-    moved = task.grid.largest(jnp.abs(change))
+    moved = task.layout.largest(jnp.abs(change))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
     moves, distance = state.moves, moved
@@ -237,7 +231,7 @@ def _advance(task: Task, state: State, start: Scalar) -> State:
         distance = jnp.where(task.is_chain, moved, certificates.distance(task, moves, moved, value))
     policy, fastest, bound = _look(task, value, state.policy, moved=distance, first=state.step < 0)
     if not task.scheme.monotone:
-        moves = certificates.moves_after(state, moved, certificates.turns_back(task.grid, change, policy.defect))
+        moves = certificates.moves_after(state, moved, certificates.turns_back(task.layout, change, policy.defect))
     bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
     since = certificates.steps_since_best(state, bound)
     code = certificates.tube_status(task, state, moved, certificates.judged(task, value, bound, state.best, since))
@@ -253,7 +247,7 @@ def _relaxed(task: Task, state: State, start: Scalar) -> State:
     # the bound on the next value would require an array of its own
     code = certificates.judged(task, state.value, bound, state.best, since)
     after = jnp.where(state.step < 0, value, task.impose(value + step))
-    code = certificates.tube_status(task, state, task.grid.largest(jnp.abs(after - state.value)), code)
+    code = certificates.tube_status(task, state, task.layout.largest(jnp.abs(after - state.value)), code)
     return certificates.booked(state, start, bound, code, since, value=after)
 
 
@@ -264,7 +258,7 @@ def _relaxed_by_defect(task: Task, state: State, start: Scalar) -> State:
     defect = jnp.where(task.obstacles.fixed, 0, bellman.relaxation(task.on, value, task.outflow)[0])
     policy = dataclasses.replace(state.policy, defect=defect)
     left = PolicyEquation(task.obstacles.clipped(defect / task.outflow, value), Rates((), ()))
-    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counting)
+    iterate = Iterate(task.layout, value, policy, left, task.obstacles, task.counting)
     bound = certificates.error_bound(task.certificate, iterate, discount=task.problem.discount)
     since = certificates.steps_since_best(state, bound)
     code = certificates.judged(task, value, bound, state.best, since)
@@ -291,7 +285,7 @@ def _lacks_measure(task: Task, state: State) -> jax.Array:
 def _shift(task: Task, state: State) -> Scalar:
     """κ of the next correction, per unit time, with open ends."""
     assert task.outflow is not None
-    return methods.shift(task.grid.largest(task.outflow), state.step)
+    return methods.shift(task.layout.largest(task.outflow), state.step)
 
 
 def _look(
@@ -307,7 +301,7 @@ def _look(
         policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)
     assert left.fastest is not None
-    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counting)
+    iterate = Iterate(task.layout, value, policy, left, task.obstacles, task.counting)
     known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
     bound = certificates.error_bound(task.certificate, iterate, **known)
     if task.first_order is not None:  # the chain's certificate does not apply to another scheme

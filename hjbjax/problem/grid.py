@@ -18,10 +18,10 @@ import numpy as np
 from hjbjax.problem import arguments
 from hjbjax.problem.ends import KINDS, PRESCRIBED, on_face
 from hjbjax.problem.labels import with_unit, words
-from hjbjax.problem.parts import Parts
+from hjbjax.problem.layouts import Layout, OneDevice
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
-from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
+from hjbjax.problem.types import Array, DType, Number, Numbers, States
 
 CONTINUED = ("open", "linear", "robin")  # kinds of ends beyond which V is extended
 TABLED = 2**24  # points of an axis with a stored table, 128 MiB; a larger grid must not allocate before it is refused
@@ -68,7 +68,7 @@ class Grid:
     units: tuple[str, ...] = ()
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
     spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``settled``
-    parts: Parts | None = dataclasses.field(init=False, repr=False, default=None)  # over which devices; None: one
+    _layout: Layout | None = dataclasses.field(init=False, repr=False, default=None)  # None: all nodes on one device
     faces: tuple[Any, ...] = dataclasses.field(init=False, repr=False, default=())  # prescribed ends with their numbers
 
     def __post_init__(self) -> None:
@@ -193,10 +193,6 @@ class Grid:
         pairs = (pair and tuple("projected" if name in CONTINUED else name for name in pair) for pair in self.edges)
         return altered(self, edges=tuple(pairs))
 
-    def divided(self, parts: Parts) -> "Grid":
-        """The grid of one part, with the shape of its arrays."""
-        return altered(self, shape=parts.shape, parts=parts)
-
     def settled(self) -> "Grid":
         """The grid for a program in which it does not change: NumPy computes all numbers derived from its corners."""
         if any(table is None for table in self.coordinates):
@@ -209,39 +205,13 @@ class Grid:
         return altered(self, lo=lo, hi=hi, coordinates=tuple(tables), spacings=tuple(spacings))
 
     @property
-    def whole(self) -> "Grid":
-        """The grid of all parts; the grid itself on one device."""
-        return self if self.parts is None else altered(self, shape=self.parts.whole, parts=None)
-
-    def is_divided(self, axis: int) -> bool:
-        """True if the nodes along an axis are divided over several devices, so that this part holds some of them."""
-        return self.parts is not None and axis in self.parts.axes
-
-    def largest(self, values: AtNodes) -> Scalar:
-        """The largest of node values, on all devices."""
-        return jnp.max(values) if self.parts is None else self.parts.largest(values)
-
-    def least(self, values: AtNodes) -> Scalar:
-        """The smallest of node values, on all devices."""
-        return jnp.min(values) if self.parts is None else -self.parts.largest(-values)
-
-    def total(self, values: AtNodes) -> Scalar:
-        """The sum of node values, on all devices."""
-        return jnp.sum(values) if self.parts is None else self.parts.total(values)
-
-    def some(self, mask: Mask) -> Verdict:
-        """True if a mask holds at some node, on any device."""
-        return jnp.any(mask) if self.parts is None else self.parts.some(mask)
-
-    def first(self, mask: Mask) -> Scalar:
-        """The flat index, over the whole grid, of the first node of a mask, (*grid); −1 for an empty mask."""
-        if self.parts is None:
-            return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
-        return self.parts.first(mask)
+    def layout(self) -> Layout:
+        """The placement of its node arrays: on one device, except inside a program that runs on parts of the grid."""
+        return self._layout or OneDevice(self.shape)
 
     def intervals(self, axis: int) -> int:
         """The number M of intervals between ``lo`` and ``hi``."""
-        count = self.whole.shape[axis]
+        count = self.layout.whole[axis]
         return count if self.periodic[axis] else count - 1
 
     def spacing(self, axis: int) -> Number:
@@ -250,8 +220,8 @@ class Grid:
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
-        if self.parts is not None:
-            return self.parts.own(self.whole.axis(axis, dtype), axis)
+        if self._layout is not None:
+            return self._layout.own(undivided(self).axis(axis, dtype), axis)
         if self.spacings is not None:
             return jnp.asarray(self.coordinates[axis], dtype or jnp.result_type(float))
         computed, table = self._by_formula(axis), self.coordinates[axis]
@@ -389,6 +359,16 @@ class Grid:
         fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
         fraction = jnp.nan_to_num(fraction)  # no clip here: it would halve the derivative at a node
         return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
+
+
+def placed(grid: Grid, layout: Layout) -> Grid:
+    """The grid of the nodes that a layout places on this device, with the shape of its arrays."""
+    return altered(grid, shape=layout.shape, _layout=layout)
+
+
+def undivided(grid: Grid) -> Grid:
+    """The grid of the nodes of all devices."""
+    return altered(grid, shape=grid.layout.whole, _layout=None)
 
 
 def _states(x: Numbers) -> jax.Array:

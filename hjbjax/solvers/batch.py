@@ -34,7 +34,7 @@ from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem import arguments
 from hjbjax.problem.arguments import as_mesh, shown
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Lanes, spans_processes
+from hjbjax.problem.layouts import Lanes, spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Nodes

@@ -150,8 +150,7 @@ def other_ends(problem: Problem, grid: Grid) -> tuple:
 
 def _coarse_task(task: Task) -> Task | None:
     """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
-    on = dataclasses.replace(task.on.chain, mesh=None)
-    level = dataclasses.replace(task, on=on)
+    level = dataclasses.replace(task, on=task.on.chain, mesh=None)
     wanted = int(np.clip(task.grid.size // SHARE, FEWEST, MOST))
     while level.grid.size > wanted:
         coarse = nested_grids.coarser(level.grid, INTERVALS)

@@ -107,7 +107,7 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
         return None
     else:
         level = task.on.chain.on_grid(coarse)
-        made = prepared(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
+        made = prepared(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level), mesh=task.mesh)
         on = dataclasses.replace(task.on.on_grid(coarse), cut=made.on.cut)
         made = dataclasses.replace(made, on=on, certificate=task.certificate)
         if task.first_order is not None:

@@ -8,14 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
-from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.markov_chain import node_checks
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Parts, spans_processes
+from hjbjax.problem.layouts import Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.checkpoints import check_alike
@@ -83,9 +82,9 @@ def _run_in_parts(march: March, front: Front, until: Number, most: Number, parts
     """``time_stepping.run`` on all devices of a mesh, each with its own nodes."""
 
     def here(march: March, front: Front, until: Number, most: Number) -> Front:
-        return time_stepping.run(on_part(march, parts), front, until, most)
+        return time_stepping.run(march.on_part(parts), front, until, most)
 
-    over = over_nodes(march, parts.entries), _front_over_nodes(front), False, False
+    over = march.over_nodes(parts.entries), _front_over_nodes(front), False, False
     return parts.mapped(here, over, over[1])(march, front, until, most)
 
 
@@ -94,9 +93,9 @@ def _greedy_in_parts(march: March, value: Field, t: Number, parts: Parts) -> Fee
     """``_greedy`` on all devices of a mesh."""
 
     def here(march: March, value: Field, t: Number) -> Feedback:
-        return _greedy(on_part(march, parts), value, t)
+        return _greedy(march.on_part(parts), value, t)
 
-    return parts.mapped(here, (over_nodes(march, parts.entries), True, False), True)(march, value, t)
+    return parts.mapped(here, (march.over_nodes(parts.entries), True, False), True)(march, value, t)
 
 
 def _front_over_nodes(front: Front) -> Front:
@@ -172,7 +171,7 @@ def drive_march(
 ) -> tuple[Slices, Front, Status]:
     """The slices at the kept times, the last front and its status; ends at a code, the time limit, or Ctrl-C."""
     start = None if start is None else jnp.asarray(start, np.dtype(task.horizon.dtype))
-    value, parts = _terminal(task.on.at(task.horizon), start), task.on.parts
+    value, parts = _terminal(task.on.at(task.horizon), start), task.parts
     front = time_stepping.begin(task, value, horizon - kept[-1])
     finite = bool(jnp.all(jnp.isfinite(front.value)))
     run = MarchRun(task, front, kept) if parts is None else MarchInParts(task, front, kept, parts)
@@ -322,7 +321,7 @@ class MarchInParts(MarchRun):
     def __init__(self, task: March, front: Front, kept: np.ndarray, parts: Parts):
         super().__init__(task, front, kept)
         self.parts, self._over = parts, _front_over_nodes(front)
-        self._divided, self.front = parts.spread((task, front), (over_nodes(task, task.grid.shape), self._over))
+        self._divided, self.front = parts.spread((task, front), (task.over_nodes(task.grid.shape), self._over))
         self._run = lambda _, *front_and_limits: _run_in_parts(self._divided, *front_and_limits, parts=parts)
 
     def _clock(self, left: float) -> Any:

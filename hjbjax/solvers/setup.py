@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation import cut_cells, schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
@@ -147,7 +148,7 @@ def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Stan
         return None
     costs = jnp.where(jnp.isfinite(still.least), still.least, 0)
     small = resting.ROUNDINGS * jnp.finfo(on.dtype).eps * jnp.max(jnp.abs(costs))
-    ends = certificates.lowest_end(obstacles, jnp.ones(on.grid.shape, bool), on.grid)
+    ends = certificates.lowest_end(obstacles, jnp.ones(on.grid.shape, bool), on.grid.layout)
     # finite, since values are compared with a multiple of it
     return jnp.where(jnp.all(costs >= -small), ends, jnp.finfo(on.dtype).min / 8).astype(on.dtype)
 
@@ -215,14 +216,17 @@ def assumptions_of(on: Discretisation) -> Assumptions:
 _prepare_jit = jax.jit(prepare, static_argnames="assumptions")
 
 
-def prepared(on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions) -> Task:
+def prepared(
+    on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions, mesh: Mesh | None = None
+) -> Task:
     """The task of ``prepare`` at host level, with spacings and coordinates as constants of the program."""
     made = _prepare_jit(on.settled, method=method, tol=tol, assumptions=assumptions)
-    return altered(made, on=altered(made.on, grid=jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)))
+    grid = jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)
+    return altered(made, on=altered(made.on, grid=grid), mesh=mesh)
 
 
 def prepare_on_host(
-    on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None
+    on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None, mesh: Mesh | None = None
 ) -> tuple[Task, Assumptions, Reach | None]:
     """The task of ``prepare``, with the checks that require values: if and where there is a finite solution.
 
@@ -240,8 +244,8 @@ def prepare_on_host(
     if may_miss(on):
         assumptions = dataclasses.replace(assumptions, exact=False)
     if is_bare(method):
-        return *_bare(on, method, tol, assumptions), None
-    task = prepared(on, method=method, tol=tol, assumptions=assumptions)
+        return *_bare(on, method, tol, assumptions, mesh), None
+    task = prepared(on, method=method, tol=tol, assumptions=assumptions, mesh=mesh)
     priced = assumptions.certificate is Certificate.MULTIPLICATIVE
     # where L = 0 the bound by the running cost fails, and a run may cycle indefinitely at no cost, as well as rest
     if (priced and not _costs_positive(task)) or problem.cost is None:
@@ -251,7 +255,7 @@ def prepare_on_host(
         )
     if priced and problem.is_game and not _costs_positive(task) and not method.relaxes:
         # policies that continue indefinitely at no cost have any value; the required one is the limit of long horizons
-        task = prepared(on, method=ValueIteration(), tol=tol, assumptions=assumptions)
+        task = prepared(on, method=ValueIteration(), tol=tol, assumptions=assumptions, mesh=mesh)
     if priced and not _costs_positive(task):
         assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
@@ -273,7 +277,9 @@ def is_bare(method: Method) -> bool:
     return method.relaxes and not method.policy
 
 
-def _bare(on: Discretisation, method: Method, tol: float, assumptions: Assumptions) -> tuple[Task, Assumptions]:
+def _bare(
+    on: Discretisation, method: Method, tol: float, assumptions: Assumptions, mesh: Mesh | None
+) -> tuple[Task, Assumptions]:
     """The task and the assumptions of a solve that stores only V, without an array of the nodes."""
     additive = assumptions.certificate is Certificate.ADDITIVE
     if not (additive or is_constrained(on.problem)) or on.grid.sides("open"):
@@ -283,7 +289,10 @@ def _bare(on: Discretisation, method: Method, tol: float, assumptions: Assumptio
         )
     certificate = Certificate.ADDITIVE if additive else Certificate.NONE
     on, nothing = cast(on, on.dtype), bellman.Obstacles(jnp.zeros((), bool), jnp.zeros((), on.dtype))
-    task = Task(on, method, nothing, jnp.ones((), bool), None, None, jnp.asarray(tol, on.dtype), certificate, bare=True)
+    task = Task(
+        on, method, nothing, jnp.ones((), bool), None, None, jnp.asarray(tol, on.dtype), certificate, bare=True,
+        mesh=mesh,
+    )  # fmt: skip
     return task, dataclasses.replace(assumptions, certificate=certificate, may_rest=False)
 
 

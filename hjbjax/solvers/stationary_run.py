@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
-from hjbjax.problem.parts import Lanes, Parts, spans_processes
+from hjbjax.problem.layouts import Lanes, Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
 from hjbjax.solution.checkpoints import check_alike
@@ -47,9 +46,9 @@ def _run_in_parts(task: Task, state: State, until: Number, parts: Parts) -> Stat
     """``fixed_point.run`` on all devices of a mesh, each with its own nodes."""
 
     def here(task: Task, state: State, until: Number) -> State:
-        return fixed_point.run(on_part(task, parts), state, until)
+        return fixed_point.run(task.on_part(parts), state, until)
 
-    over = over_nodes(task, parts.entries), state_over_nodes(state), False
+    over = task.over_nodes(parts.entries), state_over_nodes(state), False
     return parts.mapped(here, over, over[1])(task, state, until)
 
 
@@ -73,7 +72,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
       The last state, its status, and the residuals of all steps, starting with the guess.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    parts = task.on.parts
+    parts = task.parts
     iteration = StationaryRun(task, guess, limit) if parts is None else RunInParts(task, guess, limit, parts)
     if most is not None:
         iteration.name += ", computing a guess"
@@ -207,7 +206,7 @@ class RunInParts(StationaryRun):
     def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts):
         super().__init__(task, guess, limit)
         self.grid, self.parts, self._over = task.grid, parts, state_over_nodes(self.state)
-        self.task = parts.spread(self.task, over_nodes(self.task, task.grid.shape))
+        self.task = parts.spread(self.task, self.task.over_nodes(task.grid.shape))
         self.before = self.state = parts.spread(self.state, self._over)
         self._run = functools.partial(_run_in_parts, parts=parts)
 

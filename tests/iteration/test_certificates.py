@@ -39,7 +39,7 @@ def measured(kind, problem, grid, value, obstacles, least_cost, counted, moved):
     on = Discretisation(problem, grid, Upwind(), value.dtype)
     policy = bellman.greedy(on, value, obstacles.fixed)
     equation = bellman.policy_equation(on, value, policy, obstacles)
-    iterate = certificates.Iterate(grid, value, policy, equation, obstacles, counted)
+    iterate = certificates.Iterate(grid.layout, value, policy, equation, obstacles, counted)
     bound = certificates.error_bound(kind, iterate, discount=problem.discount, least_cost=least_cost, moved=moved)
     return bound, equation
 
@@ -343,5 +343,5 @@ def test_a_correction_turns_back_where_v_changed_most(sign):
     grid = Grid([0.0], [1.0], (5,))
     change = sign * jnp.array([0.1, 1.0, 0.8, 0.1, 0.0])
     onwards = sign * jnp.array([-9.0, 0.2, -0.1, -9.0, -9.0])  # elsewhere V may ask for what it likes
-    assert not certificates.turns_back(grid, change, onwards)
-    assert certificates.turns_back(grid, change, -onwards)
+    assert not certificates.turns_back(grid.layout, change, onwards)
+    assert certificates.turns_back(grid.layout, change, -onwards)

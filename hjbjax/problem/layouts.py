@@ -1,13 +1,14 @@
-"""The nodes of a grid in parts, one per device of a mesh, and the exchange of values between parts.
+"""Layouts of the nodes of a grid: all on one device, or in parts, one per device of a mesh.
 
-Domain decomposition by ``jax.shard_map``: every device runs the single-device program on its part of the grid. It
-fetches the nodes just beyond its part from the neighbouring parts by ``ppermute`` and reduces by ``pmax`` or ``psum``.
-The i-th axis of the mesh divides the i-th axis of the grid. With N nodes, part k of p has the nodes from ⌊kN/p⌋ up to
-⌊(k + 1)N/p⌋, so that parts differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node less
-has a filler as its last entry, a copy of the next node. No node reads the value computed at a filler, and reductions
-ignore fillers.
+A layout exchanges values between parts and reduces over all nodes. Parts are a domain decomposition by
+``jax.shard_map``: every device runs the single-device program on its part of the grid. It fetches the nodes just beyond
+its part from the neighbouring parts by ``ppermute`` and reduces by ``pmax`` or ``psum``. The i-th axis of the mesh
+divides the i-th axis of the grid. With N nodes, part k of p has the nodes from ⌊kN/p⌋ up to ⌊(k + 1)N/p⌋, so that parts
+differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node less has a filler as its last
+entry, a copy of the next node. No node reads the value computed at a filler, and reductions ignore fillers.
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -18,15 +19,152 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hjbjax.problem.types import AtNodes, Mask, Scalar
+from hjbjax.problem.types import Array, AtNodes, Mask, Scalar, Verdict
 
 T = TypeVar("T")
 FEWEST = 3  # nodes of a part along a divided axis: the reach of Weno5 and of a parabola beyond an end
 
 
+class Layout(abc.ABC):
+    """The nodes of a grid in the arrays of this device, and what requires the nodes of other devices too.
+
+    Attributes:
+      whole: the number of nodes of the whole grid along every axis.
+    """
+
+    whole: tuple[int, ...]
+
+    @property
+    @abc.abstractmethod
+    def sizes(self) -> tuple[int, ...]:
+        """The number of parts along every axis."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of entries of one part's arrays along every axis."""
+        return tuple(-(-count // size) for count, size in zip(self.whole, self.sizes, strict=True))
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The axes of the grid that are divided."""
+        return tuple(axis for axis, size in enumerate(self.sizes) if size > 1)
+
+    def is_divided(self, axis: int) -> bool:
+        """True if the nodes along an axis are divided over several devices, so that this part holds some of them."""
+        return axis in self.axes
+
+    def even(self, axis: int) -> bool:
+        """True if all parts have the same number of nodes along an axis."""
+        return self.whole[axis] % self.sizes[axis] == 0
+
+    @abc.abstractmethod
+    def count(self, axis: int) -> int | Scalar:
+        """The number of nodes of this part along an axis; a known number if all parts have the same number."""
+
+    @abc.abstractmethod
+    def last(self, axis: int, step: int) -> Array:
+        """The entries that hold the last node of an axis in the direction of ``step``, bool."""
+
+    @abc.abstractmethod
+    def own(self, table: Any, axis: int) -> Any:
+        """This part's entries of a table of all nodes along an axis."""
+
+    @abc.abstractmethod
+    def at_end(self, axis: int, step: int) -> Verdict | bool:
+        """True if this part is at the end of an axis in the direction of ``step``."""
+
+    @abc.abstractmethod
+    def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
+        """The values of the neighbouring part in the direction of ``step``; zero beyond the ends unless cyclic."""
+
+    @abc.abstractmethod
+    def cleared(self, values: AtNodes) -> AtNodes:
+        """Node values with zeros in the fillers."""
+
+    @abc.abstractmethod
+    def largest(self, values: AtNodes) -> Scalar:
+        """The largest of the values at all nodes; NaN if one of them is NaN."""
+
+    @abc.abstractmethod
+    def least(self, values: AtNodes) -> Scalar:
+        """The smallest of the values at all nodes; NaN if one of them is NaN."""
+
+    @abc.abstractmethod
+    def total(self, values: AtNodes) -> Scalar:
+        """The sum of the values at all nodes."""
+
+    @abc.abstractmethod
+    def some(self, mask: Mask) -> Verdict:
+        """True if a mask holds at some node."""
+
+    @abc.abstractmethod
+    def first(self, mask: Mask) -> Scalar:
+        """The smallest index in C order of the nodes of a mask, (*grid); −1 for an empty mask."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OneDevice(Layout):
+    """All nodes of a grid on one device.
+
+    Args:
+      whole: the number of nodes along every axis.
+    """
+
+    whole: tuple[int, ...]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """One part along every axis."""
+        return (1,) * len(self.whole)
+
+    def count(self, axis: int) -> int:
+        """The number of nodes along an axis."""
+        return self.whole[axis]
+
+    def last(self, axis: int, step: int) -> np.ndarray:
+        """The last node of an axis in the direction of ``step``, bool; NumPy, so that it is a small constant."""
+        return np.arange(self.whole[axis]) == (self.whole[axis] - 1 if step > 0 else 0)
+
+    def own(self, table: Any, axis: int) -> Any:
+        """The table."""
+        return table
+
+    def at_end(self, axis: int, step: int) -> bool:
+        """True: the only part is at both ends."""
+        return True
+
+    def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
+        """The values themselves: the only part is its own neighbour on a periodic axis."""
+        return values
+
+    def cleared(self, values: AtNodes) -> AtNodes:
+        """The values: there are no fillers."""
+        return values
+
+    def largest(self, values: AtNodes) -> Scalar:
+        """The largest of the values."""
+        return jnp.max(values)
+
+    def least(self, values: AtNodes) -> Scalar:
+        """The smallest of the values."""
+        return jnp.min(values)
+
+    def total(self, values: AtNodes) -> Scalar:
+        """The sum of the values."""
+        return jnp.sum(values)
+
+    def some(self, mask: Mask) -> Verdict:
+        """True if the mask holds at some node."""
+        return jnp.any(mask)
+
+    def first(self, mask: Mask) -> Scalar:
+        """The smallest index in C order of the nodes of the mask; −1 for an empty mask."""
+        return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
+
+
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Parts:
+class Parts(Layout):
     """The nodes of a grid over the devices of a mesh. Traced methods work only inside ``shard_map``.
 
     Args:
@@ -50,23 +188,9 @@ class Parts:
         return (*self.mesh.devices.shape, *[1] * (len(self.whole) - self.mesh.devices.ndim))
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """The number of entries of one part's arrays along every axis."""
-        return tuple(-(-count // size) for count, size in zip(self.whole, self.sizes, strict=True))
-
-    @property
-    def axes(self) -> tuple[int, ...]:
-        """The axes of the grid that are divided."""
-        return tuple(axis for axis, name in enumerate(self.names) if name is not None)
-
-    @property
     def fits(self) -> bool:
         """True if no part has fewer nodes than a stencil reads."""
         return all(self.whole[axis] // self.sizes[axis] >= FEWEST for axis in self.axes)
-
-    def even(self, axis: int) -> bool:
-        """True if all parts have the same number of nodes along an axis."""
-        return self.whole[axis] % self.sizes[axis] == 0
 
     def _starts(self, axis: int) -> np.ndarray:
         """The first node of every part along an axis, followed by the number of nodes, (p + 1,)."""
@@ -155,9 +279,10 @@ class Parts:
         start = jnp.asarray(self._starts(axis)[:-1], jnp.int32)[self.index(axis)]
         return start + jnp.arange(self.shape[axis], dtype=jnp.int32)
 
-    def last(self, axis: int, step: int) -> jax.Array:
-        """The entries that hold the last node of a divided axis in the direction of ``step``, bool."""
-        return self.nodes(axis) == (self.whole[axis] - 1 if step > 0 else 0)
+    def last(self, axis: int, step: int) -> Array:
+        """The entries that hold the last node of an axis in the direction of ``step``, bool."""
+        nodes = self.nodes(axis) if self.is_divided(axis) else np.arange(self.whole[axis])
+        return nodes == (self.whole[axis] - 1 if step > 0 else 0)
 
     def own(self, table: Any, axis: int) -> Any:
         """This part's entries of a table of all nodes along an axis."""
@@ -171,6 +296,8 @@ class Parts:
 
     def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
         """The values of the neighbouring part in the direction of ``step``; zero beyond the ends unless cyclic."""
+        if not self.is_divided(axis):
+            return values
         last, size = self.sizes[axis] - 1, self.sizes[axis]
         pairs = [((k + step) % size, k) for k in range(size) if cyclic or k != (last if step > 0 else 0)]
         return jax.lax.ppermute(values, self.names[axis], pairs)
@@ -200,6 +327,10 @@ class Parts:
     def largest(self, values: AtNodes) -> jax.Array:
         """The largest of the values at all nodes; NaN if one of them is NaN."""
         return self._reduced(values, jnp.max, _largest, -jnp.inf)
+
+    def least(self, values: AtNodes) -> jax.Array:
+        """The smallest of the values at all nodes; NaN if one of them is NaN."""
+        return -self.largest(-values)
 
     def total(self, values: AtNodes) -> jax.Array:
         """The sum of the values at all nodes."""

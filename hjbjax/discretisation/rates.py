@@ -25,8 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise, schemes, stencil
-from hjbjax.discretisation.cut_cells import links
+from hjbjax.discretisation import schemes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
@@ -97,8 +96,8 @@ def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[O
     """The rate of every jump for drift f and diffusion a."""
     grid = on.grid
     table: dict[Offset, Any] = {}
-    for axis, link in enumerate(links(on.chain)):
-        left = correlated_noise.along_axis(a, grid, axis)
+    for axis, link in enumerate(on.chain.links):
+        left = stencil.noise_along(a, grid, axis)
         upward, downward = schemes.weights(on.scheme.chain, f[axis], left, link, grid, axis)
         for step, weight, length in ((1, upward, link.up), (-1, downward, link.down)):
             beyond = stencil.wall(grid, axis, step)

@@ -20,6 +20,7 @@ import numpy as np
 from hjbjax.problem.grid import Grid, undivided
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, AtNodes, Field, Number
+from hjbjax.tracing import checks
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -252,6 +253,20 @@ def grid_links(grid: Grid, axis: int) -> Links:
     up, down = jnp.append(gaps, gaps[-1:]), jnp.append(gaps[:1], gaps)
     up, down = grid.layout.own(up, axis), grid.layout.own(down, axis)
     return Links(up.reshape(along), down.reshape(along))
+
+
+def noise_along(a: dict[tuple[int, int], jax.Array], grid: Grid, axis: int) -> Any:
+    """a_ii − Σ_j |a_ij| h_i/h_j: the noise left for jumps along axis i after the diagonal jumps; None without any."""
+    left = a.get((axis, axis))
+    if left is None:
+        return None
+    for (i, j), entry in a.items():
+        if i != j:
+            checks.refuse_stretched(grid)  # between unequal cells there are no diagonals
+        if i != j and axis in (i, j):
+            other = j if axis == i else i
+            left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))
+    return left
 
 
 def one_sided(values: Field, grid: Grid, axis: int, link: Links | None = None) -> tuple[Field, Field]:

@@ -19,7 +19,6 @@ from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import Rates, jump_rates
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates, methods
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
@@ -114,7 +113,7 @@ class Task(GridTask):
         additive = self.certificate is Certificate.ADDITIVE and self.first_order is None
         if not (self.method.by_defect and additive) or self.bare:
             return False
-        players = players_of(self.on)
+        players = self.on.players
         at_ends = players.control.fastest_at_ends and players.disturbance.fastest_at_ends
         return at_ends and players.exact and self.scheme.monotone
 
@@ -202,7 +201,7 @@ def run(task: Task, state: State, until: Number) -> State:
     def step(state: State) -> State:
         # made loop-variant, otherwise XLA compiles a kernel for every scalar of every action that it can hoist
         controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
-        on = dataclasses.replace(task.on, problem=altered(task.problem, controls=controls), grid=grid)
+        on = altered(task.on, problem=altered(task.problem, controls=controls), grid=grid)
         return _advance(dataclasses.replace(task, on=on), dataclasses.replace(state, step=count), start)
 
     state = jax.lax.while_loop(lambda at: (at.code == Status.RUNNING) & (at.step < until), step, state)
@@ -331,7 +330,7 @@ class _Look:
 
     def relaxed(self) -> Field:
         """r/(Q + β) for the fastest action; without ``outflow`` the policy's own rate is used."""
-        task, policy, players = self.task, self.state.policy, players_of(self.task.on)
+        task, policy, players = self.task, self.state.policy, self.task.on.players
         assert task.outflow is not None
         if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
             return policy.defect / task.outflow

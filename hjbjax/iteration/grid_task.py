@@ -58,5 +58,6 @@ class GridTask:
             return np.shape(leaf) == shape
 
         # except the leaves of the problem and the grid, which may have this shape by chance
-        nothing, cut = jax.tree.map(lambda _: False, self.on), jax.tree.map(mark, self.on.cut)
-        return altered(jax.tree.map(mark, altered(self, on=None)), on=altered(nothing, cut=cut))
+        marked = jax.tree.map(mark, altered(self, on=altered(self.on, problem=None, grid=None)))
+        problem, grid = jax.tree.map(lambda _: False, (self.problem, self.grid))
+        return altered(marked, on=altered(marked.on, problem=problem, grid=grid))

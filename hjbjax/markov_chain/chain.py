@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges, stencil
-from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Chain, Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.discretisation.schemes import Upwind
@@ -177,7 +176,7 @@ def transition_arrays(
         for action in actions
     )
     with own_settings(x64=True):
-        cut = links(Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64)))
+        cut = Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64)).links
         surcharge = decision_process.surcharge(cut, given, grid)
     tables = (
         (jumps.offsets, jumps.values, cost + decision_process.paid(jumps, surcharge), ~leaving)

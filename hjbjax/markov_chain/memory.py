@@ -16,7 +16,7 @@ import numpy as np
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian.players import find_players, shared
+from hjbjax.discretisation.players import find_players, shared
 from hjbjax.iteration.evaluation import Krylov
 from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.iteration.time_methods import TimeMethod

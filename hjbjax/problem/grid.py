@@ -67,7 +67,7 @@ class Grid:
     edges: Any = "projected"
     units: tuple[str, ...] = ()
     coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
-    spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``settled``
+    spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``tabulated``
     _layout: Layout | None = dataclasses.field(init=False, repr=False, default=None)  # None: all nodes on one device
     faces: tuple[Any, ...] = dataclasses.field(init=False, repr=False, default=())  # prescribed ends with their numbers
 
@@ -193,8 +193,8 @@ class Grid:
         pairs = (pair and tuple("projected" if name in CONTINUED else name for name in pair) for pair in self.edges)
         return altered(self, edges=tuple(pairs))
 
-    def settled(self) -> "Grid":
-        """The grid for a program in which it does not change: NumPy computes all numbers derived from its corners."""
+    def tabulated(self) -> "Grid":
+        """The grid with spacings and coordinates that NumPy computed, as constants for programs on one grid."""
         if any(table is None for table in self.coordinates):
             return self
         lo, hi = (tuple(np.asarray(corner)) for corner in (self.lo, self.hi))

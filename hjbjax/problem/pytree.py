@@ -337,8 +337,14 @@ def as_partial(function: Callable | None, name: str = "function") -> jax.tree_ut
 
 
 def altered(tree: T, **fields: Any) -> T:
-    """A copy with changed fields and without the checks of ``dataclasses.replace``, which would fail on tracers."""
+    """A copy with changed fields and without the checks of ``dataclasses.replace``, which would fail on tracers.
+
+    Cached properties are computed again, because they may depend on the changed fields.
+    """
     result = copy.copy(tree)  # shallow, and without __init__
+    for name, member in vars(type(tree)).items():
+        if isinstance(member, functools.cached_property):
+            vars(result).pop(name, None)
     for name, value in fields.items():
         object.__setattr__(result, name, value)
     return result

@@ -283,7 +283,7 @@ def _solve_together(
                 node_checks.check_values(on, clock)
                 admissibility.check_constrained_ends(on.problem, on.grid, on.dtype)
                 if choices.scheme:
-                    on = asked[name] = dataclasses.replace(on, scheme=choose_scheme(on, method))
+                    on = asked[name] = on.with_scheme(choose_scheme(on, method))
                 prepared[name] = prepare_on_host(on.chain, method=method, tol=tol, clock=clock)
                 followed = replace_chain(on, prepared[name][2], tol, None, clock) if choices.both else None
         except Stopped as stop:

@@ -164,7 +164,7 @@ def _coarse_task(task: Task) -> Task | None:
 def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     """|W − V| on the grid ``fine``, from V on a coarse one."""
     grid = altered(level.grid, edges=other_ends(level.problem, level.grid))
-    others = dataclasses.replace(level.on, grid=grid, cut=None)
+    others = level.on.on_grid(grid)
     restricted, policy = _defect(level, jnp.asarray(before, level.tol.dtype))
     start, defect = jax.device_get((restricted, policy.defect))
     obstacles = _fixed_next_to_lost(level)

@@ -16,7 +16,6 @@ from jax.sharding import Mesh
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import check_choice
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
@@ -353,7 +352,7 @@ def _prepare(
 def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool, bool]:
     """Three flags: steps must check the rates, correlated noise under their actions, and Isaacs' gap."""
     problem = on.problem
-    players, moving = players_of(on), problem.time_dependent
+    players, moving = on.players, problem.time_dependent
     # Q is known in advance if it is largest at an end of the sets; otherwise only under the chosen actions
     sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
     # a stage after the first is at a later time, at which Q may exceed the limit of the first

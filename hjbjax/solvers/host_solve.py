@@ -107,7 +107,7 @@ def settled_on_host(
         admissibility.check_constrained_ends(problem, grid, on.dtype)
         sharpen = choices.scheme
         if sharpen:
-            on = dataclasses.replace(on, scheme=choose_scheme(on, method))
+            on = on.with_scheme(choose_scheme(on, method))
             sharpen = on.scheme.subcell  # value iteration and tubes must start from the chain, also on a coarser grid
         task, assumptions, reach = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock, mesh=mesh)
         may_follow = choices.both and mesh is None  # arcs read nodes far away

@@ -9,7 +9,6 @@ import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.hamiltonian import discrete
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.markov_chain import node_checks
@@ -59,7 +58,7 @@ def _gap_at(task: March, value: Field, t: Number) -> tuple[Scalar, Scalar]:
     There is no gap if the players drive separate components, or if each is upwinded separately.
     """
     # then H is a sum over the players, and min max equals max min at every node
-    if players_of(task.on).decoupled:
+    if task.on.players.decoupled:
         return jnp.zeros(()), jnp.ones(())
     hamiltonian = discrete.around(task.on.at(t), value)
     return isaacs_gap(hamiltonian, ~task.obstacles_at(t).fixed)

@@ -175,7 +175,7 @@ def replace_chain(
         return None
     if not can_replace_chain(on.problem, on.grid):
         return None
-    on = dataclasses.replace(on, scheme=Upwind(), cut=None)
+    on = on.with_scheme(Upwind())
     try:
         plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
         memory.fitting(arc_bytes(on.grid, plan, on.dtype), on.grid, None)

@@ -7,12 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from hjbjax.discretisation import cut_cells, schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian.exact import may_miss
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
@@ -33,6 +31,7 @@ DIRECT = 50_000  # largest plane grid with open ends that is solved by sparse LU
 # A sweep receives values of the adjacent part only at the next exchange: 1600 x 1601 nodes on two devices took 19 steps
 # of three sweeps and 1.4 s, 14 steps of five and 1.2 s; 800 x 801 nodes take 0.23 s and 0.27 s.
 BETWEEN_PARTS, MANY = 5, 10**6  # sweeps, and the number of nodes above which they are used
+LINKS = 200_000  # largest grid whose cut links are stored: 34 bytes per node and axis, but half the compile time
 NEST = 100_000  # nodes above which compiling coarser grids pays
 COARSEST = 20_000  # nodes of the coarsest grid: for fewer a step takes under a millisecond, but compiling a second
 
@@ -102,7 +101,7 @@ def choose_scheme(on: Discretisation, method: Method) -> Scheme:
     problem, calm = on.problem, Limited().chain
     if method.relaxes or (is_constrained(problem) and is_discounted(problem) is False):
         return Upwind()
-    if problem.noise is not None and bool(_central(dataclasses.replace(on, scheme=calm))):
+    if problem.noise is not None and bool(_central(on.with_scheme(calm))):
         return calm
     return Limited()
 
@@ -111,8 +110,7 @@ def choose_scheme(on: Discretisation, method: Method) -> Scheme:
 def _central(on: Discretisation) -> jax.Array:
     """True if central differences are monotone at all nodes, for every action."""
     on = cast(on, on.dtype)
-    calm = schemes.calm(on, on.coordinates(), cut_cells.links(on))
-    return jnp.all(jnp.stack([jnp.all(axis) for axis in calm]))
+    return jnp.all(jnp.stack([jnp.all(axis) for axis in on.central_nodes(on.coordinates(), on.links)]))
 
 
 def linear_solve(grid: Grid) -> Direct | Krylov:
@@ -122,7 +120,8 @@ def linear_solve(grid: Grid) -> Direct | Krylov:
 
 def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "Assumptions") -> Task:
     """The task of a solve, all arrays in its dtype; pure, so that it may be traced, batched and differentiated."""
-    on = cut_cells.kept(cast(on, on.dtype))
+    on = cast(on, on.dtype)
+    on = on.with_links() if stores_links(on) else on
     obstacles, still = _obstacles(on, assumptions)
     # a tube with a traced discount uses relaxations if it is zero, which only the compiled program can decide
     undecided = assumptions.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
@@ -136,6 +135,11 @@ def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "As
         jnp.asarray(tol, on.dtype), assumptions.certificate, still.crossing if priced and still else None,
         floor=_floor(on, obstacles, still),
     )  # fmt: skip
+
+
+def stores_links(on: Discretisation) -> bool:
+    """True if a program stores the links cut by a target: the grid is small enough."""
+    return on.cuts_links and on.grid.size <= LINKS
 
 
 def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Standstill | None) -> Scalar | None:
@@ -157,8 +161,8 @@ def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.
     """The obstacles, including rest points, and where the system can rest, if this matters to the problem."""
     obstacles, problem = bellman.obstacles(on), on.problem
     if on.scheme.subcell and problem.exit_cost is not None:
-        links = cut_cells.links(on)
-        met = [jnp.min(jnp.where(*meets, 0)) for link in links for meets in (link.meets_up, link.meets_down) if meets]
+        ends = (meets for link in on.links for meets in (link.meets_up, link.meets_down))
+        met = [jnp.min(jnp.where(*meets, 0)) for meets in ends if meets]
         # a lower bound on V must not exceed any exit cost, also where the boundary is between the nodes
         obstacles = dataclasses.replace(obstacles, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
     if not (assumptions.may_rest or assumptions.costs_certify):
@@ -203,7 +207,7 @@ def assumptions_of(on: Discretisation) -> Assumptions:
         # extrapolated values do not belong to a chain, so none of the bounds holds
         return dataclasses.replace(assumptions_of(on.on_grid(on.grid.walled)), certificate=Certificate.OPEN)
     problem = on.problem
-    players, discounted = players_of(on), is_discounted(problem)
+    players, discounted = on.players, is_discounted(problem)
     if discounted:
         return Assumptions(Certificate.ADDITIVE, players.exact, may_rest=False)
     fits = problem.running_max is None and problem.cost is not None and not players.disturbance_costs
@@ -220,7 +224,7 @@ def prepared(
     on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions, mesh: Mesh | None = None
 ) -> Task:
     """The task of ``prepare`` at host level, with spacings and coordinates as constants of the program."""
-    made = _prepare_jit(on.settled, method=method, tol=tol, assumptions=assumptions)
+    made = _prepare_jit(on.on_grid(on.grid.tabulated()), method=method, tol=tol, assumptions=assumptions)
     grid = jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)
     return altered(made, on=altered(made.on, grid=grid), mesh=mesh)
 

@@ -175,7 +175,7 @@ class StationaryRun(StatesInChunks):
     """The iteration of a task of the chain, or of a high-order task based on it."""
 
     def __init__(self, task: Task, guess: Nodes, limit: int):
-        task = altered(task, on=task.on.settled)
+        task = altered(task, on=altered(task.on, grid=task.grid.tabulated()))
         super().__init__(task, fixed_point.begin(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:

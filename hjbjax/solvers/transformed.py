@@ -156,7 +156,7 @@ def _differentiable(task: Task, scheme: Scheme, found: Found) -> tuple[jax.Array
 
     if scheme.monotone:
         return by(task)
-    sharp = dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme), certificate=Certificate.RESIDUAL)
+    sharp = dataclasses.replace(task, on=task.on.with_scheme(scheme), certificate=Certificate.RESIDUAL)
     if not task.constrained:
         sharp = dataclasses.replace(sharp, obstacles=dataclasses.replace(sharp.obstacles, lower=found.floor))
     return jax.lax.cond(found.sharp, lambda: by(sharp), lambda: by(task))
@@ -164,7 +164,7 @@ def _differentiable(task: Task, scheme: Scheme, found: Found) -> tuple[jax.Array
 
 def _on_arcs(on: Discretisation, found: Found) -> tuple[jax.Array, Greedy]:
     """Value and policy of a solution on arcs, as functions of the numbers in the problem and in the grid."""
-    on = cast(dataclasses.replace(on, scheme=Upwind()), on.dtype)
+    on = cast(on.with_scheme(Upwind()), on.dtype)
     plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
     legs = tuple(int(leg) for leg in plan.legs)
     equation = ArcEquation(on, plan.actions, legs, found.arc, found.fixed, found.counted)

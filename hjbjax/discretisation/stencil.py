@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.grid import Grid, undivided
-from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.grid import CONTINUED, Grid, undivided
+from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.problem.types import Array, AtNodes, Field, Number
 from hjbjax.tracing import checks
 
@@ -45,6 +45,12 @@ def has_walls(grid: Grid, axis: int) -> bool:
 def has_wall(grid: Grid, axis: int, step: int) -> bool:
     """True if an end stops drift and noise; False at open ends and where the slope is prescribed, as V continues."""
     return (axis, step) not in grid.sides("open") and (axis, step) not in grid.sides("neumann")
+
+
+def walled(grid: Grid) -> Grid:
+    """The grid with the ends of a Markov chain: projected ends instead of open, linear and Robin ends."""
+    pairs = (pair and tuple("projected" if name in CONTINUED else name for name in pair) for pair in grid.edges)
+    return altered(grid, edges=tuple(pairs))
 
 
 def sloped(grid: Grid, axis: int, step: int) -> Any:

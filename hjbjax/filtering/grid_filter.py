@@ -34,7 +34,7 @@ from hjbjax.problem.pytree import cast, front_door, is_traced, numbers, pytree_d
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, DType, Field, Number, Numbers, State
 from hjbjax.solution.status import warn
-from hjbjax.tracing import components
+from hjbjax.tracing import checks, components
 
 
 @pytree_dataclass()
@@ -107,7 +107,7 @@ class GridFilter:
         name = "GridFilter"
         if not isinstance(grid, Grid):
             raise TypeError(f"{name}: got {type(grid).__name__} for the grid, wanted a Grid")
-        grid.refuse_prescribed(name, "which prescribe V and not the law of the state")
+        checks.refuse_prescribed(grid, name, "which prescribe V and not the law of the state")
         if grid.sides("open"):
             raise ValueError(
                 f"{name}: got a grid with open ends, where mass would leave; choose edges='projected', and a box with "

@@ -132,7 +132,7 @@ def reached(
       least: a rate per unit time; jumps at rates up to it count as rounding.
       clock: the limits; raises ``Stopped`` when they are exceeded.
     """
-    on = on.on_grid(on.grid.walled)  # a path that leaves through an open end may not return
+    on = on.on_grid(stencil.walled(on.grid))  # a path that leaves through an open end may not return
     clock, found, maybe = clock or Clock(), np.zeros(on.grid.shape, bool), np.zeros(on.grid.shape, bool)
     points, few = tried_actions.control_samples(on.problem)
     # A few actions suffice for most problems. Nodes that samples do not reach may be reached by an action that keeps
@@ -169,7 +169,7 @@ def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock)
     as for ``reached``. Takes one step per cell of the longest path, each over all pairs of actions, so use it for
     failing games.
     """
-    found, on = np.ones(on.grid.shape, bool), on.on_grid(on.grid.walled)
+    found, on = np.ones(on.grid.shape, bool), on.on_grid(stencil.walled(on.grid))
     while True:
         # The outer loop removes nodes; the inner loop starts from the target each time and adds nodes. Reaching a set
         # while staying inside another is a greatest fixed point of a least fixed point.

@@ -17,7 +17,7 @@ from hjbjax.discretisation import correlated_noise, schemes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, tabulated
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Mask, Numbers, Scalar, Verdict
@@ -44,7 +44,7 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
     actions = _actions(problem)
     # one compiled program for all schemes whose chain is correct by construction
     chain = Upwind() if isinstance(scheme.chain, Upwind) else scheme.chain
-    on = on.with_scheme(chain).on_grid(on.grid.tabulated())
+    on = on.with_scheme(chain).on_grid(tabulated(on.grid))
     # x64 for 64-bit counts; the functions are still evaluated in ``dtype``
     with own_settings(x64=True):
         # nearly every problem passes and skips the counts and first nodes, which are slow on a CPU

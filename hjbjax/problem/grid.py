@@ -8,7 +8,7 @@ node on the boundary of a target must be inside or outside it in all programs al
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import arguments
-from hjbjax.problem.ends import KINDS, PRESCRIBED, on_face
+from hjbjax.problem.ends import PRESCRIBED, on_face
 from hjbjax.problem.labels import with_unit, words
 from hjbjax.problem.layouts import Layout, OneDevice
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
@@ -66,10 +66,10 @@ class Grid:
     stretch: tuple[Stretching | None, ...] = ()
     edges: Any = "projected"
     units: tuple[str, ...] = ()
-    coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
-    spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``tabulated``
+    _coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
+    _spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``tabulated``
     _layout: Layout | None = dataclasses.field(init=False, repr=False, default=None)  # None: all nodes on one device
-    faces: tuple[Any, ...] = dataclasses.field(init=False, repr=False, default=())  # prescribed ends with their numbers
+    _faces: tuple[Any, ...] = dataclasses.field(init=False, repr=False, default=())  # the numbers of prescribed ends
 
     def __post_init__(self) -> None:
         lo, hi = arguments.corner(self.lo, "lo"), arguments.corner(self.hi, "hi")
@@ -98,11 +98,13 @@ class Grid:
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         tables = (self._by_formula(axis) if count <= TABLED else None for axis, count in enumerate(shape))
-        object.__setattr__(self, "coordinates", tuple(tables))
-        object.__setattr__(self, "faces", tuple(self._faces(axis, given) for axis, given in enumerate(ends)))
-        self.check_spacings(np.float64)  # a solve repeats this in its own dtype, which may be float32
+        object.__setattr__(self, "_coordinates", tuple(tables))
+        object.__setattr__(self, "_faces", tuple(self._prescriptions(axis, given) for axis, given in enumerate(ends)))
+        for axis, nodes in enumerate(self._coordinates):
+            if isinstance(nodes, np.ndarray):  # a solve repeats this in its own dtype, which may be float32
+                arguments.check_nodes(nodes, axis, np.float64)
 
-    def _faces(self, axis: int, pair: tuple[Any, Any] | None) -> tuple[Any, Any] | None:
+    def _prescriptions(self, axis: int, pair: tuple[Any, Any] | None) -> tuple[Any, Any] | None:
         """The prescriptions at the two ends of an axis, evaluated at their nodes; None if neither is prescribed."""
         if pair is None or not any(isinstance(end, PRESCRIBED) for end in pair):
             return None
@@ -122,46 +124,9 @@ class Grid:
     def prescribed(self, *kinds: str) -> list[tuple[int, int, Any]]:
         """The prescribed ends of these kinds, or of all kinds: axis, step, and the prescription at the nodes."""
         found = (
-            (axis, step, pair[(step + 1) // 2]) for axis, pair in enumerate(self.faces) if pair for step in (-1, 1)
+            (axis, step, pair[(step + 1) // 2]) for axis, pair in enumerate(self._faces) if pair for step in (-1, 1)
         )
         return [each for each in found if each[2] is not None and (not kinds or each[2].kind in kinds)]
-
-    def refuse_prescribed(self, name: str, why: str) -> None:
-        """Refuse prescribed ends on behalf of a function, with the reason.
-
-        Raises:
-          ValueError: the grid has prescribed ends.
-        """
-        found = sorted({type(end).__name__ for _, _, end in self.prescribed()})
-        if found:
-            raise ValueError(f"{name}: got a grid with {' and '.join(found)} ends, {why}; use edges='projected'")
-
-    def check_spacings(self, dtype: DType) -> None:
-        """Refuse nodes that coincide up to rounding in ``dtype``, because differences of values would be rounding too.
-
-        Raises:
-          ValueError: with the axis and its ends.
-        """
-        for axis, nodes in enumerate(self.coordinates):
-            if isinstance(nodes, np.ndarray):  # not traced, and not too many to be stored
-                arguments.check_nodes(nodes, axis, dtype)
-
-    def check_indices(self) -> None:
-        """Refuse a grid that no solve can use, before anything of the size of the grid is allocated or compiled.
-
-        Raises:
-          MemoryError: more nodes than 32-bit indices can number; the message has the largest possible N.
-          ValueError: prescribed ends without their numbers, as on a grid from a file.
-        """
-        arguments.check_count(self.shape)
-        known = {(axis, step) for axis, step, _ in self.prescribed()}
-        if missing := {side for kind in KINDS for side in self.sides(kind)} - known:
-            axis, step = min(missing)
-            raise ValueError(
-                f"Grid.edges: the {'upper' if step > 0 else 'lower'} end of {self.names[axis]} is prescribed, but its "
-                "numbers are unknown, because files do not store them. Make the Grid again with hjb.Dirichlet(value), "
-                "hjb.Neumann(slope) or hjb.Robin(rate)"
-            )
 
     @property
     def ndim(self) -> int:
@@ -188,23 +153,6 @@ class Grid:
         return [(axis, step) for axis, pair in ends for step, name in zip((-1, 1), pair, strict=True) if name in kinds]
 
     @property
-    def walled(self) -> "Grid":
-        """The grid with the ends of a Markov chain: projected ends instead of open, linear and Robin ends."""
-        pairs = (pair and tuple("projected" if name in CONTINUED else name for name in pair) for pair in self.edges)
-        return altered(self, edges=tuple(pairs))
-
-    def tabulated(self) -> "Grid":
-        """The grid with spacings and coordinates that NumPy computed, as constants for programs on one grid."""
-        if any(table is None for table in self.coordinates):
-            return self
-        lo, hi = (tuple(np.asarray(corner)) for corner in (self.lo, self.hi))
-        tables, spacings = [], []
-        for axis, (low, high, table) in enumerate(zip(lo, hi, self.coordinates, strict=True)):
-            tables.append(checked_table(self._by_formula(axis), np.asarray(table), max(abs(low), abs(high))))
-            spacings.append((high - low) / self.intervals(axis))
-        return altered(self, lo=lo, hi=hi, coordinates=tuple(tables), spacings=tuple(spacings))
-
-    @property
     def layout(self) -> Layout:
         """The placement of its node arrays: on one device, except inside a program that runs on parts of the grid."""
         return self._layout or OneDevice(self.shape)
@@ -216,15 +164,15 @@ class Grid:
 
     def spacing(self, axis: int) -> Number:
         """The distance h between neighbours along ``axis``; the mean distance on a stretched axis."""
-        return self.spacings[axis] if self.spacings else (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
+        return self._spacings[axis] if self._spacings else (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
         if self._layout is not None:
             return self._layout.own(undivided(self).axis(axis, dtype), axis)
-        if self.spacings is not None:
-            return jnp.asarray(self.coordinates[axis], dtype or jnp.result_type(float))
-        computed, table = self._by_formula(axis), self.coordinates[axis]
+        if self._spacings is not None:
+            return jnp.asarray(self._coordinates[axis], dtype or jnp.result_type(float))
+        computed, table = self._by_formula(axis), self._coordinates[axis]
         table = computed if table is None else table
         # NumPy if nothing is traced, also inside ``jit``, where the table then is a constant
         if is_traced(computed, table):
@@ -359,6 +307,23 @@ class Grid:
         fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
         fraction = jnp.nan_to_num(fraction)  # no clip here: it would halve the derivative at a node
         return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
+
+
+def tabulated(grid: Grid) -> Grid:
+    """The grid with spacings and coordinates that NumPy computed, as constants for programs on one grid."""
+    if any(table is None for table in grid._coordinates):
+        return grid
+    lo, hi = (tuple(np.asarray(corner)) for corner in (grid.lo, grid.hi))
+    tables, spacings = [], []
+    for axis, (low, high, table) in enumerate(zip(lo, hi, grid._coordinates, strict=True)):
+        tables.append(checked_table(grid._by_formula(axis), np.asarray(table), max(abs(low), abs(high))))
+        spacings.append((high - low) / grid.intervals(axis))
+    return altered(grid, lo=lo, hi=hi, _coordinates=tuple(tables), _spacings=tuple(spacings))
+
+
+def with_prescriptions_of(grid: Grid, other: Grid, change: Callable[[Any], Any]) -> Grid:
+    """The grid with the prescribed ends of another grid, whose numbers at the nodes are changed by a function."""
+    return altered(grid, _faces=jax.tree.map(change, other._faces))
 
 
 def placed(grid: Grid, layout: Layout) -> Grid:

@@ -120,9 +120,9 @@ def solve_batch(
         if not isinstance(lane, Problem):
             raise TypeError(f"solve_batch: lane {number} is {shown(lane)}; wanted only problems")
         check_arguments(lane, grid, method, scheme, tol)
-    grid.check_indices()
+    checks.check_indices(grid)
     kind = arguments.as_dtype(dtype)
-    grid.check_spacings(kind)
+    checks.check_spacings(grid, kind)
     solutions: list[Any] = [None] * len(lanes)
     over = Lanes(None if mesh is None else _over_lanes(mesh, lanes, grid, method, checkpoint))
     clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(over.mesh))

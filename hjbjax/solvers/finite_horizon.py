@@ -133,7 +133,7 @@ def march(
     _check(problem, grid, scheme, method, step, time_limit)
     if not isinstance(policy, bool):
         raise TypeError(f"march: policy is {policy!r}; wanted True or False")
-    grid.check_indices()
+    checks.check_indices(grid)
     horizon, kept = _times(horizon, times)
     traced = is_traced(problem, grid, method, start)
     if mesh is not None:
@@ -146,7 +146,7 @@ def march(
     if np.any(np.diff(kept.astype(kind)) <= 0):
         raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; remove one")
     check_node_values(start, grid, "march: start")
-    grid.check_spacings(kind)
+    checks.check_spacings(grid, kind)
     clock = Clock(seconds=time_limit, progress=progress, together=spans_processes(mesh))
     opened = checkpoints.open_checkpoint(
         checkpoint, [problem], grid, resume=resume, caller="march", together=clock.together, horizon=horizon,

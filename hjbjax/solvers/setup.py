@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.discretisation.schemes import Limited, Upwind
@@ -18,7 +19,7 @@ from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.markov_chain import attainability, resting
 from hjbjax.markov_chain.attainability import Reach
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, tabulated
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, known
 from hjbjax.problem.types import Mask, Number, Scalar
@@ -205,7 +206,7 @@ def assumptions_of(on: Discretisation) -> Assumptions:
     """The assumptions from the structure of the problem; a traced discount leaves the certificate undecided."""
     if on.grid.sides("open"):
         # extrapolated values do not belong to a chain, so none of the bounds holds
-        return dataclasses.replace(assumptions_of(on.on_grid(on.grid.walled)), certificate=Certificate.OPEN)
+        return dataclasses.replace(assumptions_of(on.on_grid(stencil.walled(on.grid))), certificate=Certificate.OPEN)
     problem = on.problem
     players, discounted = on.players, is_discounted(problem)
     if discounted:
@@ -224,7 +225,7 @@ def prepared(
     on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions, mesh: Mesh | None = None
 ) -> Task:
     """The task of ``prepare`` at host level, with spacings and coordinates as constants of the program."""
-    made = _prepare_jit(on.on_grid(on.grid.tabulated()), method=method, tol=tol, assumptions=assumptions)
+    made = _prepare_jit(on.on_grid(tabulated(on.grid)), method=method, tol=tol, assumptions=assumptions)
     grid = jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)
     return altered(made, on=altered(made.on, grid=grid), mesh=mesh)
 

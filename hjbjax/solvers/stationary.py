@@ -115,7 +115,7 @@ def solve(
     """
     check_limits(max_steps, time_limit)
     check_arguments(problem, grid, method, scheme, tol, guess, paths=True)
-    grid.check_indices()  # also inside transformations, where the memory is not checked
+    checks.check_indices(grid)  # also inside transformations, where the memory is not checked
     traced, free = is_traced(problem, grid, guess, tol), method is None
     if mesh is not None:
         known = choose(problem, grid, traced=traced, method=method, divided=True)
@@ -132,7 +132,7 @@ def solve(
         return _solve_traced(problem, grid, asked, guess, tol)
     kind = arguments.as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
-    grid.check_spacings(kind)
+    checks.check_spacings(grid, kind)
     clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(mesh))
     opened = checkpoints.open_checkpoint(
         checkpoint, [problem], grid, resume=resume, caller="solve", together=clock.together, method=method,

@@ -11,6 +11,7 @@ import numpy as np
 
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
+from hjbjax.problem.grid import tabulated
 from hjbjax.problem.layouts import Lanes, Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
@@ -175,7 +176,7 @@ class StationaryRun(StatesInChunks):
     """The iteration of a task of the chain, or of a high-order task based on it."""
 
     def __init__(self, task: Task, guess: Nodes, limit: int):
-        task = altered(task, on=altered(task.on, grid=task.grid.tabulated()))
+        task = altered(task, on=altered(task.on, grid=tabulated(task.grid)))
         super().__init__(task, fixed_point.begin(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:

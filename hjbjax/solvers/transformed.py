@@ -42,6 +42,7 @@ from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
 from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain, finish_arcs
 from hjbjax.solvers.setup import assumptions_of, check_on_one_state, choose, is_bare, prepare
+from hjbjax.tracing import checks
 
 NOTHING = [[1.0, -np.inf], [1.0, np.inf]]  # an enclosure without information
 
@@ -244,7 +245,7 @@ def _solved(
     """The result of one lane, in NumPy; its warnings are dropped, because the user's line is not on the stack."""
     clock = Clock(asked.max_steps or 10**9, asked.time_limit, progress=False)
     with own_settings(x64=asked.x64), keeping_warnings():
-        grid.check_spacings(asked.inner)
+        checks.check_spacings(grid, asked.inner)
         choices = Choices(scheme=asked.scheme is None, method=method is None, levels=method is None)
         may_follow = _may_follow(asked, problem, grid)
         method = choose(problem, grid, traced=False, method=method)

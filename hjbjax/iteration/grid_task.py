@@ -44,7 +44,7 @@ class GridTask:
     @property
     def parts(self) -> Parts | None:
         """The parts of the nodes over the mesh; None for one device, and for grids too small to divide."""
-        parts = None if self.mesh is None else Parts(self.mesh, self.grid.shape)
+        parts = None if self.mesh is None else Parts(self.grid.shape, self.mesh)
         return parts if parts is not None and parts.fits else None
 
     def on_part(self: T, parts: Parts) -> T:

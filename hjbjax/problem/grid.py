@@ -18,7 +18,7 @@ import numpy as np
 from hjbjax.problem import arguments
 from hjbjax.problem.ends import PRESCRIBED, on_face
 from hjbjax.problem.labels import with_unit, words
-from hjbjax.problem.layouts import Layout, OneDevice
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
 from hjbjax.problem.types import Array, DType, Number, Numbers, States
@@ -155,7 +155,7 @@ class Grid:
     @property
     def layout(self) -> Layout:
         """The placement of its node arrays: on one device, except inside a program that runs on parts of the grid."""
-        return self._layout or OneDevice(self.shape)
+        return self._layout or Layout(self.shape)
 
     def intervals(self, axis: int) -> int:
         """The number M of intervals between ``lo`` and ``hi``."""

@@ -8,7 +8,6 @@ differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with 
 entry, a copy of the next node. No node reads the value computed at a filler, and reductions ignore fillers.
 """
 
-import abc
 import dataclasses
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -25,19 +24,21 @@ T = TypeVar("T")
 FEWEST = 3  # nodes of a part along a divided axis: the reach of Weno5 and of a parabola beyond an end
 
 
-class Layout(abc.ABC):
-    """The nodes of a grid in the arrays of this device, and what requires the nodes of other devices too.
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """The nodes of a grid in the arrays of this device: all of them on one device; see ``Parts`` for several.
 
-    Attributes:
+    Args:
       whole: the number of nodes of the whole grid along every axis.
     """
 
     whole: tuple[int, ...]
 
     @property
-    @abc.abstractmethod
     def sizes(self) -> tuple[int, ...]:
         """The number of parts along every axis."""
+        return (1,) * len(self.whole)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -51,114 +52,55 @@ class Layout(abc.ABC):
 
     def is_divided(self, axis: int) -> bool:
         """True if the nodes along an axis are divided over several devices, so that this part holds some of them."""
-        return axis in self.axes
+        return self.sizes[axis] > 1
 
     def even(self, axis: int) -> bool:
         """True if all parts have the same number of nodes along an axis."""
         return self.whole[axis] % self.sizes[axis] == 0
 
-    @abc.abstractmethod
     def count(self, axis: int) -> int | Scalar:
         """The number of nodes of this part along an axis; a known number if all parts have the same number."""
-
-    @abc.abstractmethod
-    def last(self, axis: int, step: int) -> Array:
-        """The entries that hold the last node of an axis in the direction of ``step``, bool."""
-
-    @abc.abstractmethod
-    def own(self, table: Any, axis: int) -> Any:
-        """This part's entries of a table of all nodes along an axis."""
-
-    @abc.abstractmethod
-    def at_end(self, axis: int, step: int) -> Verdict | bool:
-        """True if this part is at the end of an axis in the direction of ``step``."""
-
-    @abc.abstractmethod
-    def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
-        """The values of the neighbouring part in the direction of ``step``; zero beyond the ends unless cyclic."""
-
-    @abc.abstractmethod
-    def cleared(self, values: AtNodes) -> AtNodes:
-        """Node values with zeros in the fillers."""
-
-    @abc.abstractmethod
-    def largest(self, values: AtNodes) -> Scalar:
-        """The largest of the values at all nodes; NaN if one of them is NaN."""
-
-    @abc.abstractmethod
-    def least(self, values: AtNodes) -> Scalar:
-        """The smallest of the values at all nodes; NaN if one of them is NaN."""
-
-    @abc.abstractmethod
-    def total(self, values: AtNodes) -> Scalar:
-        """The sum of the values at all nodes."""
-
-    @abc.abstractmethod
-    def some(self, mask: Mask) -> Verdict:
-        """True if a mask holds at some node."""
-
-    @abc.abstractmethod
-    def first(self, mask: Mask) -> Scalar:
-        """The smallest index in C order of the nodes of a mask, (*grid); −1 for an empty mask."""
-
-
-@dataclasses.dataclass(frozen=True)
-class OneDevice(Layout):
-    """All nodes of a grid on one device.
-
-    Args:
-      whole: the number of nodes along every axis.
-    """
-
-    whole: tuple[int, ...]
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """One part along every axis."""
-        return (1,) * len(self.whole)
-
-    def count(self, axis: int) -> int:
-        """The number of nodes along an axis."""
         return self.whole[axis]
 
-    def last(self, axis: int, step: int) -> np.ndarray:
-        """The last node of an axis in the direction of ``step``, bool; NumPy, so that it is a small constant."""
+    def last(self, axis: int, step: int) -> Array:
+        """The entries that hold the last node of an axis in the direction of ``step``, bool."""
+        # NumPy, so that it is a small constant
         return np.arange(self.whole[axis]) == (self.whole[axis] - 1 if step > 0 else 0)
 
     def own(self, table: Any, axis: int) -> Any:
-        """The table."""
+        """This part's entries of a table of all nodes along an axis."""
         return table
 
-    def at_end(self, axis: int, step: int) -> bool:
-        """True: the only part is at both ends."""
+    def at_end(self, axis: int, step: int) -> Verdict | bool:
+        """True if this part is at the end of an axis in the direction of ``step``."""
         return True
 
     def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
-        """The values themselves: the only part is its own neighbour on a periodic axis."""
+        """The values of the neighbouring part in the direction of ``step``; zero beyond the ends unless cyclic."""
         return values
 
     def cleared(self, values: AtNodes) -> AtNodes:
-        """The values: there are no fillers."""
+        """Node values with zeros in the fillers."""
         return values
 
     def largest(self, values: AtNodes) -> Scalar:
-        """The largest of the values."""
+        """The largest of the values at all nodes; NaN if one of them is NaN."""
         return jnp.max(values)
 
     def least(self, values: AtNodes) -> Scalar:
-        """The smallest of the values."""
+        """The smallest of the values at all nodes; NaN if one of them is NaN."""
         return jnp.min(values)
 
     def total(self, values: AtNodes) -> Scalar:
-        """The sum of the values."""
+        """The sum of the values at all nodes."""
         return jnp.sum(values)
 
     def some(self, mask: Mask) -> Verdict:
-        """True if the mask holds at some node."""
+        """True if a mask holds at some node."""
         return jnp.any(mask)
 
     def first(self, mask: Mask) -> Scalar:
-        """The smallest index in C order of the nodes of the mask; −1 for an empty mask."""
+        """The smallest index in C order of the nodes of a mask, (*grid); −1 for an empty mask."""
         return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
 
 
@@ -168,12 +110,11 @@ class Parts(Layout):
     """The nodes of a grid over the devices of a mesh. Traced methods work only inside ``shard_map``.
 
     Args:
-      mesh: the devices, with at most as many axes as the grid.
       whole: the number of nodes of the whole grid along every axis.
+      mesh: the devices, with at most as many axes as the grid.
     """
 
     mesh: Mesh
-    whole: tuple[int, ...]
 
     @property
     def names(self) -> tuple[str | None, ...]:

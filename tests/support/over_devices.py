@@ -192,7 +192,7 @@ def stencils():
     }
     found = {}
     for name, (grid, shape) in grids.items():
-        parts, value = Parts(mesh_of(*shape), grid.shape), np.random.default_rng(0).normal(size=grid.shape)
+        parts, value = Parts(grid.shape, mesh_of(*shape)), np.random.default_rng(0).normal(size=grid.shape)
 
         def here(grid, value, mask, parts=parts):
             return read_of_others(placed(grid, parts), value, mask)
@@ -213,7 +213,7 @@ def stencils():
 @case
 def not_a_number_is_not_lost():
     """A NaN at one node of one part is the largest of all."""
-    parts = Parts(mesh_of(4, 2), FLAT.shape)
+    parts = Parts(FLAT.shape, mesh_of(4, 2))
     values = np.zeros(FLAT.shape, np.float32)
     values[30, 3] = np.nan
 

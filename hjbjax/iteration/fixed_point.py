@@ -181,7 +181,7 @@ def begin(task: Task, guess: Nodes) -> State:
     traced, dtype = is_traced(task, guess), guess.dtype
     xp: Any = jnp if traced else np
     copied: Any = jnp.array if traced else functools.partial(jax.device_put, may_alias=False)
-    value: Any = copied(guess) if task.parts is None else guess
+    value: Any = copied(guess) if not task.division.axes else guess
     shape = () if task.bare else task.grid.shape  # of the policy
     players = (None if task.bare else admissible for admissible in (task.problem.controls, task.problem.disturbances))
     inputs = [0 if admissible is None else admissible.dim for admissible in players]

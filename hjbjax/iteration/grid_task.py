@@ -42,14 +42,14 @@ class GridTask:
         return self.grid.layout
 
     @property
-    def parts(self) -> Parts | None:
-        """The parts of the nodes over the mesh; None for one device, and for grids too small to divide."""
+    def division(self) -> Layout:
+        """The layout of the iteration: parts over the mesh, or one device, also for grids too small to divide."""
         parts = None if self.mesh is None else Parts(self.grid.shape, self.mesh)
-        return parts if parts is not None and parts.fits else None
+        return parts if parts is not None and parts.fits else self.layout
 
-    def on_part(self: T, parts: Parts) -> T:
-        """The task on the part of one device, inside ``shard_map``."""
-        return altered(self, on=altered(self.on, grid=placed(self.grid, parts)))
+    def on_part(self: T, layout: Layout) -> T:
+        """The task on the nodes of one device, inside ``shard_map`` if they are divided."""
+        return altered(self, on=altered(self.on, grid=placed(self.grid, layout)))
 
     def over_nodes(self: T, shape: tuple[int, ...]) -> T:
         """Mark the leaves that have a value at every node, that is, have this ``shape``."""

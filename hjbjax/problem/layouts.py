@@ -103,6 +103,35 @@ class Layout:
         """The smallest index in C order of the nodes of a mask, (*grid); −1 for an empty mask."""
         return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
 
+    # On the host: arrays of the whole grid and arrays of all parts.
+
+    @property
+    def entries(self) -> tuple[int, ...]:
+        """The shape of an array of all parts, including fillers."""
+        return tuple(width * size for width, size in zip(self.shape, self.sizes, strict=True))
+
+    @property
+    def is_local(self) -> bool:
+        """True if this process holds all parts."""
+        return True
+
+    def spread(self, tree: T, over_nodes: Any) -> T:
+        """Divide arrays of the whole grid over the devices, and copy the others to every device.
+
+        Args:
+          tree: numbers and arrays.
+          over_nodes: a tree of the same structure, True for leaves with one value per node, (*grid).
+        """
+        return tree
+
+    def gathered(self, tree: T, over_nodes: Any) -> T:
+        """The inverse of ``spread``: NumPy arrays of the whole grid if it is divided."""
+        return tree
+
+    def mapped(self, function: Callable, over_nodes: Any, result_over_nodes: Any) -> Callable:
+        """A function that runs on every device at once, each with its own part of arrays from ``spread``."""
+        return function
+
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
@@ -149,20 +178,13 @@ class Parts(Layout):
         width = self.shape[axis]
         return np.concatenate([k * width + np.arange(n) for k, n in enumerate(np.diff(starts))])
 
-    # On the host: arrays of the whole grid and arrays of all parts.
-
     @property
-    def entries(self) -> tuple[int, ...]:
-        """The shape of an array of all parts, including fillers."""
-        return tuple(width * size for width, size in zip(self.shape, self.sizes, strict=True))
+    def is_local(self) -> bool:
+        """True if this process holds all parts."""
+        return not spans_processes(self.mesh)
 
     def spread(self, tree: T, over_nodes: Any) -> T:
-        """Divide arrays of the whole grid over the devices, and copy the others to every device.
-
-        Args:
-          tree: numbers and arrays.
-          over_nodes: a tree of the same structure, True for leaves with one value per node, (*grid).
-        """
+        """Divide arrays of the whole grid over the devices, and copy the others to every device."""
 
         def put(leaf: Any, divided: bool) -> jax.Array:
             host = np.asarray(leaf)

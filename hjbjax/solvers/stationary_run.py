@@ -12,7 +12,7 @@ import numpy as np
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import HISTORY, State, Task
 from hjbjax.problem.grid import tabulated
-from hjbjax.problem.layouts import Lanes, Parts, spans_processes
+from hjbjax.problem.layouts import Lanes, Layout
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
 from hjbjax.solution.checkpoints import check_alike
@@ -43,7 +43,7 @@ def _run_lanes(tasks: Task, states: State, until: Array, over: Lanes) -> State:
 
 
 @functools.partial(WideJit, static_argnames="parts", donate_argnames="state")
-def _run_in_parts(task: Task, state: State, until: Number, parts: Parts) -> State:
+def _run_in_parts(task: Task, state: State, until: Number, parts: Layout) -> State:
     """``fixed_point.run`` on all devices of a mesh, each with its own nodes."""
 
     def here(task: Task, state: State, until: Number) -> State:
@@ -73,8 +73,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
       The last state, its status, and the residuals of all steps, starting with the guess.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    parts = task.parts
-    iteration = StationaryRun(task, guess, limit) if parts is None else RunInParts(task, guess, limit, parts)
+    iteration = (RunInParts if task.division.axes else StationaryRun)(task, guess, limit)
     if most is not None:
         iteration.name += ", computing a guess"
         iteration.passing = most <= clock.max_steps
@@ -204,8 +203,9 @@ class StationaryRun(StatesInChunks):
 class RunInParts(StationaryRun):
     """The iteration of a task whose nodes are divided among several devices."""
 
-    def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts):
+    def __init__(self, task: Task, guess: Nodes, limit: int):
         super().__init__(task, guess, limit)
+        parts = task.division
         self.grid, self.parts, self._over = task.grid, parts, state_over_nodes(self.state)
         self.task = parts.spread(self.task, self.task.over_nodes(task.grid.shape))
         self.before = self.state = parts.spread(self.state, self._over)
@@ -223,7 +223,7 @@ class RunInParts(StationaryRun):
     def keep(self, error: Exception) -> None:
         """Attach the value to an exception, as without parts."""
         # data in other processes is inaccessible, since they may not have raised this exception
-        states = () if spans_processes(self.parts.mesh) else (self.state, self.before)
+        states = (self.state, self.before) if self.parts.is_local else ()
         values = (lambda s=s: self.parts.gathered(s, self._over).value for s in states)
         host_loop.keep(error, self.grid, *values, lambda: self.guess)
 

@@ -234,8 +234,8 @@ def compiled_program():
         for shape in ((8,), (4, 2)):
             on = Discretisation(PLAIN, ANGLE, hjb.Upwind(), np.float64)
             task, *_ = setup.prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3, mesh=mesh_of(*shape))
-            parts = task.parts
-            run = stationary_run.RunInParts(task, np.zeros(ANGLE.shape), 10, parts)
+            parts = task.division
+            run = stationary_run.RunInParts(task, np.zeros(ANGLE.shape), 10)
             text = stationary_run._run_in_parts.lower(run.task, run.state, 5, parts=parts).compile().as_text()
             names = ("collective-permute", "all-gather", "all-to-all", "all-reduce")
             found["x".join(map(str, shape))] = {

@@ -100,9 +100,7 @@ class Grid:
         tables = (self._by_formula(axis) if count <= TABLED else None for axis, count in enumerate(shape))
         object.__setattr__(self, "_coordinates", tuple(tables))
         object.__setattr__(self, "_faces", tuple(self._prescriptions(axis, given) for axis, given in enumerate(ends)))
-        for axis, nodes in enumerate(self._coordinates):
-            if isinstance(nodes, np.ndarray):  # a solve repeats this in its own dtype, which may be float32
-                arguments.check_nodes(nodes, axis, np.float64)
+        check_spacings(self, np.float64)  # a solve repeats this in its own dtype, which may be float32
 
     def _prescriptions(self, axis: int, pair: tuple[Any, Any] | None) -> tuple[Any, Any] | None:
         """The prescriptions at the two ends of an axis, evaluated at their nodes; None if neither is prescribed."""
@@ -307,6 +305,17 @@ class Grid:
         fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
         fraction = jnp.nan_to_num(fraction)  # no clip here: it would halve the derivative at a node
         return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
+
+
+def check_spacings(grid: Grid, dtype: DType) -> None:
+    """Refuse nodes that coincide up to rounding in ``dtype``, because differences of values would be rounding too.
+
+    Raises:
+      ValueError: with the axis and its ends.
+    """
+    for axis, nodes in enumerate(grid._coordinates):
+        if isinstance(nodes, np.ndarray):  # not traced, and not too many to be stored
+            arguments.check_nodes(nodes, axis, dtype)
 
 
 def tabulated(grid: Grid) -> Grid:

@@ -342,12 +342,18 @@ def altered(tree: T, **fields: Any) -> T:
     Cached properties are computed again, because they may depend on the changed fields.
     """
     result = copy.copy(tree)  # shallow, and without __init__
-    for name, member in vars(type(tree)).items():
-        if isinstance(member, functools.cached_property):
-            vars(result).pop(name, None)
+    owner: Any = type(tree)
+    for name in _cached_properties(owner):
+        vars(result).pop(name, None)
     for name, value in fields.items():
         object.__setattr__(result, name, value)
     return result
+
+
+@functools.cache
+def _cached_properties(cls: type) -> tuple[str, ...]:
+    """The names of the cached properties of a class."""
+    return tuple(name for name, member in vars(cls).items() if isinstance(member, functools.cached_property))
 
 
 def as_jax(tree: T) -> T:

@@ -33,7 +33,7 @@ from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem import arguments
 from hjbjax.problem.arguments import as_mesh, shown
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.layouts import Lanes, spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
@@ -122,7 +122,7 @@ def solve_batch(
         check_arguments(lane, grid, method, scheme, tol)
     checks.check_indices(grid)
     kind = arguments.as_dtype(dtype)
-    checks.check_spacings(grid, kind)
+    check_spacings(grid, kind)
     solutions: list[Any] = [None] * len(lanes)
     over = Lanes(None if mesh is None else _over_lanes(mesh, lanes, grid, method, checkpoint))
     clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(over.mesh))

@@ -22,7 +22,7 @@ from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem import arguments
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.layouts import spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
@@ -146,7 +146,7 @@ def march(
     if np.any(np.diff(kept.astype(kind)) <= 0):
         raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; remove one")
     check_node_values(start, grid, "march: start")
-    checks.check_spacings(grid, kind)
+    check_spacings(grid, kind)
     clock = Clock(seconds=time_limit, progress=progress, together=spans_processes(mesh))
     opened = checkpoints.open_checkpoint(
         checkpoint, [problem], grid, resume=resume, caller="march", together=clock.together, horizon=horizon,

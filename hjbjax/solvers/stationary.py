@@ -17,7 +17,7 @@ from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.iteration.methods import Method, check_method
 from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.layouts import spans_processes
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import as_one_program, is_traced
@@ -132,7 +132,7 @@ def solve(
         return _solve_traced(problem, grid, asked, guess, tol)
     kind = arguments.as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
-    checks.check_spacings(grid, kind)
+    check_spacings(grid, kind)
     clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(mesh))
     opened = checkpoints.open_checkpoint(
         checkpoint, [problem], grid, resume=resume, caller="solve", together=clock.together, method=method,

@@ -28,7 +28,7 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import memory
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.host_calls import call_on_host
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, is_traced, pytree_dataclass
@@ -42,7 +42,6 @@ from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
 from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain, finish_arcs
 from hjbjax.solvers.setup import assumptions_of, check_on_one_state, choose, is_bare, prepare
-from hjbjax.tracing import checks
 
 NOTHING = [[1.0, -np.inf], [1.0, np.inf]]  # an enclosure without information
 
@@ -245,7 +244,7 @@ def _solved(
     """The result of one lane, in NumPy; its warnings are dropped, because the user's line is not on the stack."""
     clock = Clock(asked.max_steps or 10**9, asked.time_limit, progress=False)
     with own_settings(x64=asked.x64), keeping_warnings():
-        checks.check_spacings(grid, asked.inner)
+        check_spacings(grid, asked.inner)
         choices = Choices(scheme=asked.scheme is None, method=method is None, levels=method is None)
         may_follow = _may_follow(asked, problem, grid)
         method = choose(problem, grid, traced=False, method=method)

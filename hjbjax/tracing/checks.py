@@ -13,13 +13,12 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.problem import sets
-from hjbjax.problem.arguments import check_count, check_mesh, check_nodes
+from hjbjax.problem.arguments import check_count, check_mesh
 from hjbjax.problem.ends import KINDS
-from hjbjax.problem.grid import TABLED, Grid
+from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, remembered
 from hjbjax.problem.settings import own_settings
-from hjbjax.problem.types import DType
 from hjbjax.tracing import indices
 from hjbjax.tracing.operations import Operations, operations
 
@@ -85,18 +84,6 @@ def refuse_prescribed(grid: Grid, name: str, why: str) -> None:
     found = sorted({type(end).__name__ for _, _, end in grid.prescribed()})
     if found:
         raise ValueError(f"{name}: got a grid with {' and '.join(found)} ends, {why}; use edges='projected'")
-
-
-def check_spacings(grid: Grid, dtype: DType) -> None:
-    """Refuse nodes that coincide up to rounding in ``dtype``, because differences of values would be rounding too.
-
-    Raises:
-      ValueError: with the axis and its ends.
-    """
-    for axis, count in enumerate(grid.shape):
-        nodes = grid.axis(axis) if count <= TABLED else None
-        if isinstance(nodes, np.ndarray):  # not traced, and not too many to be stored
-            check_nodes(nodes, axis, dtype)
 
 
 def check_indices(grid: Grid) -> None:

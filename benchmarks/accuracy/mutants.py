@@ -124,8 +124,8 @@ MUTANTS = (
     Mutant(
         "target mask",
         "iteration/bellman.py",
-        "else cut_cells.level(on) <= 0",
-        "else cut_cells.level(on) < 0",
+        "else on.level <= 0",
+        "else on.level < 0",
         ("tests/regressions/test_boundary_nodes.py",),
     ),
     Mutant(

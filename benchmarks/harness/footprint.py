@@ -31,7 +31,7 @@ def of_solve(problem: Any, grid: Any, tol: float, *, method: Any = None, dtype: 
 
         def begin(on):
             task = prepare(on, method=inner, tol=tol, assumptions=assumptions)
-            return task, fixed_point.begin(task, jax.numpy.zeros(grid.shape, kind))
+            return task, fixed_point.start(task, jax.numpy.zeros(grid.shape, kind))
 
         shapes = jax.eval_shape(begin, on)
         return {"bytes_per_node": bytes_of(stationary_run.run.lower(*shapes, 1)) / grid.size}

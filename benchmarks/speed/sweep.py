@@ -163,10 +163,10 @@ def whole_steps(problem: Any, grid: hjb.Grid, count: int) -> Any:
     """Steps of ``solve`` with value iteration, run as its host loop does."""
     method = hjb.ValueIteration()
     task, _, _ = prepare_on_host(Discretisation(problem, grid, SCHEME, KIND), method=method, tol=1e-30)
-    states = [stationary_run.run(task, fixed_point.begin(task, started(grid)), 0)]
+    states = [stationary_run.run(task, fixed_point.start(task, started(grid)), 1)]
 
     def call():
-        states[0] = stationary_run.run(task, states[0], int(states[0].step) + count)
+        states[0] = stationary_run.run(task, states[0], int(states[0].progress.evaluations) + count)
         return states[0].value
 
     return call

@@ -20,7 +20,7 @@ from hjbjax.applications.convergence import fitted_order
 from hjbjax.applications.l2_gain import InputMatrix, attenuation, saturation
 from hjbjax.applications.reference import mask_of
 from hjbjax.discretisation.discretisation import Scheme
-from hjbjax.discretisation.schemes import Limited
+from hjbjax.discretisation.schemes import Limited, check_slopes
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -150,6 +150,7 @@ def perturbation_study(
       (2.0, 2.0)
     """
     check_arguments(problem, grid, method, scheme, tol)
+    check_slopes(scheme, "perturbation_study: scheme")
     levels = _parameters("noises", noises), _parameters("gammas", gammas)
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem already has noise or disturbances; remove them")

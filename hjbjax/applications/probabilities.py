@@ -18,7 +18,7 @@ import numpy as np
 
 from hjbjax.applications import exit_problems
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.schemes import Upwind, check_slopes
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.iteration.methods import ValueIteration
 from hjbjax.markov_chain import attainability, memory, node_checks
@@ -343,6 +343,7 @@ def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     # the checks of ``solve`` in the same order, so that bad arguments are reported before all nodes are evaluated
     scheme, kind = options.get("scheme", Upwind()), arguments.as_dtype(options.get("dtype"))
     check_arguments(question, grid, options.get("method"), scheme, options["tol"])
+    check_slopes(scheme, "probability: scheme")
     # the values of traced functions are unknown; see the module docstring
     if is_traced(question, grid):
         return 0

@@ -7,7 +7,6 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.iteration.methods import Method, Nested
 from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
@@ -90,7 +89,7 @@ def estimate(
     grid: Grid,
     method: Method | None = None,
     *,
-    scheme: Scheme | PathScheme | None = None,
+    scheme: Scheme | None = None,
     tol: float = 1e-3,
     dtype: DType | None = None,
     measure: bool = True,
@@ -118,14 +117,15 @@ def estimate(
       >>> hjb.estimate(problem, grid, dtype="float32", measure=False).bytes // grid.size
       70
     """
-    check_arguments(problem, grid, method, scheme, tol, paths=True)
+    check_arguments(problem, grid, method, scheme, tol)
     kind, free = arguments.as_dtype(dtype), memory.available()
     check_on_one_state(problem, grid, scheme or Upwind())
     chosen = choose(problem, grid, traced=False, method=method)
-    if isinstance(scheme, PathScheme):
-        scheme.check(problem, grid)
+    paths = None if scheme is None else scheme.paths
+    if paths is not None:
+        paths.check(problem, grid)
         with own_settings(x64=kind == np.float64):
-            needed, programs = semi_lagrangian.arc_bytes(grid, scheme.plan(problem, grid, kind), kind), 1
+            needed, programs = semi_lagrangian.arc_bytes(grid, paths.plan(problem, grid, kind), kind), 1
     else:
         needed, programs = memory.peak_bytes(problem, grid, chosen.inner, kind), _programs(grid, chosen, scheme)
     about = Estimate(grid.shape, needed, free, _largest(needed, free, grid), programs)
@@ -136,7 +136,7 @@ def estimate(
     with keeping_warnings():
         try:
             for small in tried:
-                alike = method if isinstance(scheme, PathScheme) else _alike(chosen, small, grid)
+                alike = _alike(chosen, small, grid) if paths is None else method
                 options = {"scheme": scheme, "tol": tol, "dtype": kind, "throw": False, "progress": False}
                 found.append(solve(problem, small, method=alike, **options))
         except ValueError as refusal:

@@ -32,7 +32,7 @@ from hjbjax.plotting.slices import at_states
 from hjbjax.plotting.style import NARROW, save_figure
 from hjbjax.problem import streams
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball
+from hjbjax.problem.sets import Ball, Box
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, Status
 from hjbjax.zoo.ingredients import Exact, Feedback
@@ -217,12 +217,12 @@ def axes() -> "Axes":
 
 def is_bang_bang(problem: Problem, solution: Solution) -> bool:
     """True if the feedback jumps: it is enumerated, or 90 % of its entries are at a bound."""
-    lo, hi = getattr(problem.controls, "lo", None), getattr(problem.controls, "hi", None)
-    if solution.discrete or lo is None or hi is None:
+    box = problem.controls
+    if solution.discrete or not isinstance(box, Box):
         return solution.discrete
     # 90 %, because nodes at rest and on the switching curve may have any value
-    policy, near = _finite_controls(solution), 1e-6 * (hi - lo)
-    return policy.size > 0 and bool(np.mean((policy <= lo + near) | (policy >= hi - near)) > 0.9)
+    policy, near = _finite_controls(solution), 1e-6 * (box.hi - box.lo)
+    return policy.size > 0 and bool(np.mean((policy <= box.lo + near) | (policy >= box.hi - near)) > 0.9)
 
 
 def _is_direction(problem: Problem, solution: Solution) -> bool:

@@ -21,33 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.paths import Plan
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.stretching import into_period
-from hjbjax.problem.types import Array, AtNodes, Mask, Number, Scalar
+from hjbjax.problem.types import AtNodes, Mask, Number, Scalar
 from hjbjax.tracing import components
 
 # fraction of the greatest speed on the grid. Slower actions use this speed for the length of a leg, since near a rest
 # point crossing a cell would take arbitrarily long under one action.
 SLOWEST = 0.1
-
-
-@pytree_dataclass()
-class Plan:
-    """The arcs to try from every node: every action with every length.
-
-    Args:
-      actions: (A, m).
-      legs: the numbers of legs of the arcs, increasing integers, (R,).
-    """
-
-    actions: Array
-    legs: Array
-
-    @property
-    def count(self) -> int:
-        """K = A R: the arcs of the first action, by increasing length, then those of the next."""
-        return len(self.actions) * len(self.legs)
 
 
 @pytree_dataclass()

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import cut_cells, stencil
+from hjbjax.discretisation.paths import Paths
 from hjbjax.discretisation.players import Players, find_players
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import sets
@@ -40,6 +41,11 @@ class Scheme(abc.ABC):
     def stationary(self) -> bool:
         """True if corrections with the matrix of ``chain`` can drive the residual with these slopes to zero."""
         return True
+
+    @property
+    def paths(self) -> Paths | None:
+        """The paths that ``solve`` follows; None, the default, if the scheme has slopes."""
+        return None
 
     @property
     def even(self) -> bool:
@@ -96,6 +102,11 @@ class Chain(Scheme):
     """
 
     monotone, stages = True, 1
+
+    @property
+    def is_proven(self) -> bool:
+        """True if e is large enough for all f and a; otherwise it is checked at the nodes before a solve."""
+        return False
 
     @property
     def one_way(self) -> bool:

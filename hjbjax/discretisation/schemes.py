@@ -55,7 +55,7 @@ would represent only part of the drift, and the solve is refused. The class must
 are cached by it. Its methods are traced, so they must not branch on numbers. Under ``jit``, ``vmap`` and ``grad`` a
 solve requires a monotone scheme, and does not check values.
 
-For schemes that follow paths over many cells instead of using slopes, see ``semi_lagrangian``.
+For a scheme that follows paths over many cells instead of using slopes, see ``semi_lagrangian``.
 
 All schemes treat walls in the same way. A wall is on a node, whose cell is half a cell. With noise a, outward drift n
 (f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
@@ -78,7 +78,6 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import slopes, stencil
 from hjbjax.discretisation.discretisation import Chain, Differences, Scheme
-from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -130,23 +129,19 @@ def kinks(
     return found, [made[id(d)] for d in derivatives]
 
 
-def check_scheme(scheme: Any, name: str, grid: Grid, *, stationary: bool = False, paths: bool = False) -> None:
+def check_scheme(scheme: Any, name: str, grid: Grid, *, stationary: bool = False) -> None:
     """Refuse an object that is not a scheme, not suitable for stationary problems, or not for the grid's spacings.
-
-    With ``paths`` a scheme that follows paths is accepted too.
 
     Raises:
       TypeError: not a suitable scheme.
       ValueError: a stretched grid for a scheme that requires equal spacings.
     """
-    hashable = type(scheme).__hash__ is not None
-    if paths and hashable and not isinstance(scheme, type) and isinstance(scheme, PathScheme):
-        return
-    if not (hashable and isinstance(scheme, Scheme)) or (stationary and not scheme.stationary):
-        others = "Eno2() " * (not stationary) + "SemiLagrangian() " * paths
-        offered = f"hjb.Upwind(), Limited(), {others}or Weno5()"
+    is_scheme = type(scheme).__hash__ is not None and isinstance(scheme, Scheme)
+    if not is_scheme or not (scheme.stationary if stationary else scheme.paths is None):
+        other = "SemiLagrangian()" if stationary else "Eno2()"
         own = "a custom one derived from hjbjax.discretisation.schemes.Scheme"
-        raise TypeError(f"{name} is {arguments.shown(scheme)}; wanted {offered}, or {own}")
+        offered = f"hjb.Upwind(), Limited(), {other} or Weno5(), or {own}"
+        raise TypeError(f"{name} is {arguments.shown(scheme)}; wanted {offered}")
     if not isinstance(scheme.chain, Chain):
         raise TypeError(
             f"{name} is {arguments.shown(scheme)}, whose chain {arguments.shown(scheme.chain)} is not derived from "
@@ -157,6 +152,17 @@ def check_scheme(scheme: Any, name: str, grid: Grid, *, stationary: bool = False
         raise ValueError(
             f"{caller}: {scheme!r} requires equal spacings; remove Grid.stretch, or use Upwind() or Limited()"
         )
+
+
+def check_slopes(scheme: Scheme | None, name: str) -> None:
+    """Refuse a scheme that follows paths instead of using slopes.
+
+    Raises:
+      TypeError: offers schemes with slopes.
+    """
+    if scheme is not None and scheme.paths is not None:
+        offered = "a scheme with slopes: hjb.Upwind(), Limited() or Weno5()"
+        raise TypeError(f"{name} is {arguments.shown(scheme)}, which follows paths; wanted {offered}")
 
 
 @pytree_dataclass(static=("central", "subcell", "split"))
@@ -186,7 +192,7 @@ class Upwind(Chain):
     central: bool = True
     subcell: bool = False
     split: bool = False
-    one_way, in_parts = True, True
+    is_proven, one_way, in_parts = True, True, True
 
     def excess(self, f: Any, a: Any, link: Links) -> Any:
         """a + h⁺ f⁺ + h⁻ f⁻, or with ``central`` the larger of a and h⁺ f⁺ + h⁻ f⁻."""

@@ -13,12 +13,16 @@ the scheme with a constant control per arc.
 """
 
 import math
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.arcs import Plan
+from hjbjax.discretisation.discretisation import Differences, Scheme
+from hjbjax.discretisation.paths import Paths, Plan
+from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import arguments, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
@@ -28,27 +32,8 @@ from hjbjax.problem.types import DType
 from hjbjax.tracing import dependence
 
 
-@runtime_checkable
-class PathScheme(Protocol):
-    """A scheme that follows paths instead of using slopes; a frozen and hashable value."""
-
-    @property
-    def points(self) -> int:
-        """The least number of nodes per axis."""
-
-    @property
-    def in_parts(self) -> bool:
-        """True if many devices can share the nodes."""
-
-    def check(self, problem: Problem, grid: Grid) -> None:
-        """Refuse a problem, or a grid, that the scheme does not support."""
-
-    def plan(self, problem: Problem, grid: Grid, dtype: DType) -> Plan:
-        """The arcs to try."""
-
-
 @pytree_dataclass(static=("cells", "actions"))
-class SemiLagrangian:
+class SemiLagrangian(Scheme, Paths):
     """Long characteristic steps with monotone interpolation, for deterministic problems whose paths follow kinks.
 
     From each node arcs of 1, about √``cells`` and ``cells`` cells are tried, each under one constant action. V_h is the
@@ -86,11 +71,20 @@ class SemiLagrangian:
 
     cells: int = 16
     actions: int = 64
-    points, in_parts = 2, False
+    chain = Upwind()
 
     def __post_init__(self) -> None:
         arguments.count(self.cells, "SemiLagrangian: cells")
         arguments.count(self.actions, "SemiLagrangian: actions")
+
+    @property
+    def paths(self) -> "SemiLagrangian":
+        """The arcs."""
+        return self
+
+    def slopes(self, around: Differences) -> Sequence[tuple[jax.Array, jax.Array]]:
+        """The slopes of the chain, for checks of the problem; a solve does not use them."""
+        return around.one_sided
 
     def check(self, problem: Problem, grid: Grid) -> None:
         """Refuse problems without arcs, or without a certificate on them.

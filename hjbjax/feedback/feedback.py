@@ -87,7 +87,9 @@ def check_kept(solution: GridFeedback, duration: float, name: str) -> float:
       ValueError: the stored times end too early or are too far apart.
     """
     times = np.asarray(solution.times, np.float64)
-    horizon = float(getattr(solution, "stats", {}).get("horizon", times[-1]))
+    horizon = float(times[-1])
+    if isinstance(solution, Solution):
+        horizon = float(solution.stats.get("horizon", horizon))
     if duration > horizon * (1 + ROUNDING):
         raise ValueError(f"{name} = {duration:g} goes beyond the horizon {horizon:g} of the solution; shorten it")
     # the feedback is linear between two stored times: no gap, including both ends, may be wider than a tenth

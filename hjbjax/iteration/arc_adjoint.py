@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import arcs
-from hjbjax.discretisation.arcs import Arcs, Plan, widened
+from hjbjax.discretisation.arcs import Arcs, widened
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.paths import Plan
 from hjbjax.hamiltonian.derivatives import once
 from hjbjax.iteration import bellman
 from hjbjax.iteration.adjoint import Map, solve_in_stages

@@ -23,10 +23,10 @@ import numpy as np
 
 from hjbjax.discretisation.arcs import Arcs, widened
 from hjbjax.discretisation.rates import Rates
-from hjbjax.iteration import certificates
+from hjbjax.iteration import certificates, progress
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
-from hjbjax.iteration.fixed_point import HISTORY
+from hjbjax.iteration.progress import Progress, keep_finite
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import AtNodes, Field, Mask, Nodes, Number, Scalar
@@ -62,16 +62,19 @@ class ArcTask:
 
 @pytree_dataclass()
 class ArcState:
-    """State of a solve on arcs: a value, its best arcs, its certificate, and the bookkeeping of the loop."""
+    """State of a solve on arcs: the last evaluated value, or the guess, and the record of the loop.
+
+    Args:
+      value: V, (*grid).
+      number: the number of the best arc from every node, (*grid).
+      bound: the bound on the error of V.
+      progress: the number of evaluations, the status and the residuals.
+    """
 
     value: Field
-    number: AtNodes  # the number of the best arc from every node
+    number: AtNodes
     bound: ErrorBound
-    step: Scalar
-    best: jax.Array  # the least error and the least residual so far, (2,)
-    since_best: Scalar
-    code: Scalar
-    history: jax.Array  # residuals of this chunk, (HISTORY,), −1 for unused entries
+    progress: Progress
 
 
 class _Look(NamedTuple):
@@ -82,16 +85,11 @@ class _Look(NamedTuple):
     decline: Field
 
 
-def begin(task: ArcTask, guess: Nodes) -> ArcState:
-    """The state before the evaluation of a guess, which is step −1 of ``run``; NumPy, so that nothing is compiled."""
-    dtype, infinite = guess.dtype, np.asarray(np.inf, guess.dtype)
-    numbers: Any = (-infinite, infinite, np.zeros((), dtype), infinite, infinite)
+def start(task: ArcTask, guess: Nodes) -> ArcState:
+    """The state of a guess, which the first pass of ``run`` evaluates; nothing is compiled."""
     number: Any = np.zeros(task.grid.shape, np.int32)
-    counter = np.zeros((), np.int32)
-    first, code = np.full((), -1, np.int32), np.asarray(int(Status.RUNNING), np.int32)
     value = jax.device_put(guess, may_alias=False)  # states are donated
-    books: Any = (first, np.full(2, infinite), counter, code, np.full(HISTORY, -1, dtype))
-    return ArcState(value, number, ErrorBound(*numbers), *books)
+    return ArcState(value, number, progress.no_bound(guess.dtype), progress.no_progress(guess.dtype))
 
 
 def value_from_above(task: ArcTask) -> Field:
@@ -119,13 +117,9 @@ def value_from_above(task: ArcTask) -> Field:
 
 
 def run(task: ArcTask, state: ArcState, until: Number) -> ArcState:
-    """Step until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
-    start = state.step
-
-    def goes_on(at: ArcState) -> jax.Array:
-        return (at.code == Status.RUNNING) & (at.step < until)
-
-    return jax.lax.while_loop(goes_on, lambda at: _advance(task, at, start), state)
+    """Step until the state is not running or ``until`` values are evaluated; at most ``HISTORY`` at a time."""
+    chunk = state.progress.evaluations
+    return jax.lax.while_loop(lambda at: at.progress.is_running(until), lambda at: _advance(task, at, chunk), state)
 
 
 def look(task: ArcTask, value: Field) -> _Look:
@@ -155,24 +149,25 @@ def _unit(arcs: Arcs) -> jax.Array:
     return jnp.where(ends, jnp.maximum(arcs.running, arcs.pay), arcs.running)
 
 
-def _advance(task: ArcTask, state: ArcState, start: Scalar) -> ArcState:
+def _advance(task: ArcTask, state: ArcState, chunk: Scalar) -> ArcState:
     """One step: relax along the best arcs, then evaluate all arcs; undo the step if its numbers are not finite."""
     value = _relaxed(task, state)
     found = look(task, value)
     bound = _bound(task, value, found)
-    since = certificates.steps_since_best(state, bound)
-    code = _judge(task, value, bound, since)
-    return certificates.booked(state, start, bound, code, since, value=value, number=found.number)
+    measured = state.progress.measure(bound, chunk)
+    code = _status_after(task, value, bound, measured.since_best)
+    after = ArcState(value, found.number, bound, measured.judge(bound, code))
+    return keep_finite(code, after, dataclasses.replace(state, progress=after.progress))
 
 
 def _relaxed(task: ArcTask, state: ArcState) -> Field:
-    """V after following every node's best arc several times; for a guess not yet evaluated, V itself."""
+    """V after following every node's best arc several times; a guess has no best arcs, and is only imposed."""
     arcs = task.arcs.chosen(state.number)
 
     def follow(_: Scalar, value: Field) -> Field:
         return task.impose(arcs.worth(widened(value, task.grid), task.grid))
 
-    times = jnp.where(state.step < 0, 0, task.relaxations)
+    times = jnp.where(state.progress.evaluations == 0, 0, task.relaxations)
     return jax.lax.fori_loop(0, times, follow, task.impose(state.value))
 
 
@@ -198,12 +193,12 @@ def _bound(task: ArcTask, value: Field, found: _Look) -> ErrorBound:
     return dataclasses.replace(bound, below=jnp.minimum(bound.below, 0))
 
 
-def _judge(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar) -> Scalar:
-    """The status after a step; later lines override earlier ones."""
+def _status_after(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar) -> Scalar:
+    """The status after an evaluation; later lines override earlier ones."""
     size = jnp.max(jnp.where(task.counted, jnp.abs(value), 0))
-    rounding = certificates.ROUNDING * jnp.finfo(value.dtype).eps * size
+    rounding = progress.ROUNDING * jnp.finfo(value.dtype).eps * size
     # a policy advances by one arc per step, and a wave of improvements may cross the box four times
-    patience = jnp.where(bound.residual <= rounding, certificates.PATIENCE, 100 + 4 * sum(task.grid.shape))
+    patience = jnp.where(bound.residual <= rounding, progress.PATIENCE, 100 + 4 * sum(task.grid.shape))
     code = jnp.where(since >= patience, Status.STALLED, Status.RUNNING)
     code = jnp.where(bound.error <= task.tol, Status.CONVERGED, code)
     return jnp.where(jnp.isfinite(bound.residual), code, Status.NONFINITE).astype(jnp.int32)

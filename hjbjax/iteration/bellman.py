@@ -93,7 +93,7 @@ class Greedy:
 class PolicyEquation:
     """The linear equation δ = source + Σ_o weights_o δ(x + o) for a correction δ of the value, in cost units.
 
-    ``fastest`` is the largest Q + β of its policy, per unit time, or the number passed to ``policy_equation``.
+    ``fastest`` is the largest Q + β of its policy, per unit time; None if no rate counts as rounding.
     """
 
     source: Field
@@ -213,19 +213,24 @@ def _with_defect(on: Discretisation, value: Field, held: jax.Array, best: Field,
 
 
 def policy_equation(
-    on: Discretisation, value: Field, policy: Greedy, obstacles: Obstacles, *, fastest: Scalar | None = None
-) -> PolicyEquation:
+    on: Discretisation, value: Field, policy: Greedy, obstacles: Obstacles, *,
+    fastest: Scalar | None = None, every_rate: bool = False,
+) -> PolicyEquation:  # fmt: skip
     """The linear equation for δ under one policy; the active branch of the constraints is chosen at every node.
 
-    ``fastest``, if known for the same policy and time, saves a pass over the nodes. Zero saves it too; then every rate
-    counts, however small.
+    Rates that are small compared with the largest Q + β are rounding, and do not count unless ``every_rate`` is true.
+    This number, ``fastest``, saves a pass over the nodes if it is known for the same policy and time.
     """
     u, d = list(policy.controls), list(policy.disturbances)
     rates = jump_rates(on, u, d)
     leaving = rates.total() + on.problem.discount
-    fastest = on.grid.layout.largest(leaving) if fastest is None else fastest
-    moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
-    outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))  # where nothing moves the cost accumulates
+    if every_rate:
+        outflow = jnp.where(leaving > 0, leaving, 1)
+    else:
+        fastest = on.grid.layout.largest(leaving) if fastest is None else fastest
+        moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
+        # where nothing moves the cost accumulates
+        outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))
     # s, then min(s, ψ − V), then max(·, g − V); a row whose branch is a constraint reads δ = source
     source, free = policy.defect / outflow, ~obstacles.fixed
     if obstacles.upper is not None:
@@ -240,7 +245,7 @@ def policy_equation(
         jumps = zip(weights.offsets, weights.values, strict=True)
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
         weights = dataclasses.replace(weights, values=cut)
-    return PolicyEquation(source, weights, fastest)
+    return PolicyEquation(source, weights, None if every_rate else fastest)
 
 
 def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:

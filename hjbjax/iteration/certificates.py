@@ -15,15 +15,11 @@ count for η only. A factor 1/(1 − ρ) beyond ε^{-1/2}, with ε the unit of r
 rounding of r and L, and the bound would be useless. Both bounds follow from the comparison principle of a monotone
 scheme. They bound the algebraic error, not the discretisation error; they are valid if the minimum over the actions is
 exact, and require float64.
-
-An iteration measures its progress by these bounds: the least error and residual so far, and the number of steps since
-either decreased. They determine its status.
 """
 
 import dataclasses
 import enum
-import math
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,23 +28,10 @@ import numpy as np
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
-from hjbjax.problem.grid import undivided
 from hjbjax.problem.layouts import Layout
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
-from hjbjax.solution.status import Status
 
-S = TypeVar("S", bound=Any)
-
-GROWTH = 1e6  # growth of a residual over its smallest value that means divergence
-PATIENCE = 10  # steps without progress if the residual is rounding
-ROUNDING = 64  # in units in the last place of max|V|: smaller residuals are rounding
-FEW = 4  # the same for value-only iteration, whose steps are small at slow nodes
-# Corrections of a high-order scheme are halved, at most three times, if neither of the last two was smaller than all
-# before them and V turned back. This ends limit cycles of the limiter. Halving from the start takes a third more steps,
-# and halving in slow monotone convergence took the Dubins car on 41³ nodes 135 steps instead of 33.
-LEAST_SHARE, CALM = 0.125, 5
-SLOWEST = 0.95  # contraction rate beyond which the step size does not measure the distance; it then counts twentyfold
 LOST = 4  # roundings of numbers of size lift · max(factor, 1) in factor · V + shift
 
 
@@ -61,23 +44,6 @@ class Certificate(enum.Enum):
     RESIDUAL = "the high-order equation, whose residual this is, has no comparison principle"
     OPEN = "open ends extrapolate the value, and have no comparison principle"
     NONE = "without discount and positive running cost the residual bounds nothing"
-
-
-@pytree_dataclass()
-class Moves:
-    """The sizes of the corrections of a high-order scheme, cost units, and the resulting damping.
-
-    Args:
-      last: the last two, the latest first, scaled as if each had been taken whole; infinite if there was none.
-      least: the smallest one before the last two.
-      share: the fraction of a correction that is taken.
-      since: number of steps since ``share`` changed.
-    """
-
-    last: jax.Array
-    least: Scalar
-    share: Scalar
-    since: Scalar
 
 
 TO_THE_END = (Certificate.NONE, Certificate.BY_DISCOUNT)  # for tubes, V falls or climbs until nothing moves
@@ -290,132 +256,3 @@ def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = No
         return xp.stack([factor, xp.where(endless, outwards * xp.inf, lifted * (factor - 1) + outwards * lost)])
 
     return xp.stack([line(below, -1), line(above, 1)])
-
-
-def steps_since_best(state: Any, bound: ErrorBound) -> Scalar:
-    """The number of steps without progress, including this one: neither error nor residual reached a new minimum."""
-    return jnp.where(jnp.any(_measures(bound) < state.best), 0, state.since_best + 1)
-
-
-def moves_after(state: Any, moved: Scalar, turned: jax.Array) -> Moves:
-    """The damping after a step of size ``moved``; the evaluation of a guess is not a step.
-
-    Corrections that no longer shrink are halved if they turn back, as in a cycle, and restored if they continue in one
-    direction, as in slow convergence.
-    """
-    old = state.moves
-    whole = moved / old.share
-    last, least = jnp.stack([whole, old.last[0]]), jnp.minimum(old.least, old.last[1])
-    stuck = (jnp.minimum(whole, old.last[0]) >= least) & (old.since >= CALM)
-    fitting = jnp.where(turned, jnp.maximum(old.share / 2, LEAST_SHARE), jnp.minimum(2 * old.share, 1))
-    new = Moves(last, least, jnp.where(stuck, fitting, old.share), jnp.where(stuck, 0, old.since + 1))
-    return jax.tree.map(lambda after, before: jnp.where(state.step < 0, before, after), new, old)
-
-
-def turns_back(layout: Layout, change: Field, defect: Field) -> jax.Array:
-    """True if a correction overshot: where V changed most, its equation now requires the opposite change.
-
-    Args:
-      layout: the layout of the nodes.
-      change: the last change of V, zero at nodes that do not count, cost units, (*grid).
-      defect: the residual at the new V, positive where V should increase, cost per unit time, (*grid).
-    """
-    most = jnp.abs(change) > layout.largest(jnp.abs(change)) / 2
-    onwards = jnp.where(most, jnp.sign(change) * defect, 0)
-    return layout.largest(-onwards) > layout.largest(onwards)
-
-
-def distance(task: Any, moves: Moves, moved: Scalar, value: Field) -> Scalar:
-    """The distance from V to the limit of its iteration, cost units: step/(1 − ρ), with the observed contraction ρ.
-
-    Args:
-      task: a ``fixed_point.Task``.
-      moves: the corrections before the last one.
-      moved: the size of the last one, as taken.
-      value: V after the last one.
-    """
-    step, before = moved / moves.share, moves.last
-    known = jnp.isfinite(before) & (before > 0)
-    # over one step and over two, since two eigenvalues of opposite signs make every other step short
-    ratios = jnp.where(known, step / jnp.where(known, before, 1), 0) ** jnp.array([1.0, 0.5], step.dtype)
-    rate = jnp.where(jnp.isfinite(before[0]), jnp.max(ratios), SLOWEST)
-    rate = jnp.clip(rate, 0, SLOWEST)
-    # steps of the size of rounding do not contract and do not count
-    rounding = FEW * jnp.finfo(value.dtype).eps * _size(task.layout, value, task.counting)
-    return moved + jnp.maximum(moved - rounding, 0) * rate / (1 - rate)
-
-
-def judged(task: Any, value: Field, bound: ErrorBound, best: jax.Array, since: Scalar) -> Scalar:
-    """The status of a ``fixed_point.Task`` after a step; later lines override earlier ones."""
-    longest = task.method.patience(undivided(task.grid))
-    climbs = task.constrained or task.method.relaxes
-    to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
-    if to_the_end:  # a front moves V at every node by the spacing times the slope, one step after the other
-        longest = jnp.maximum(longest, 100 + 4 * math.prod(task.layout.whole))
-
-    def converged(code: Any, tol: Scalar) -> Scalar:
-        code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
-        return jnp.where(jnp.isfinite(bound.residual), code, Status.NONFINITE).astype(jnp.int32)
-
-    def by_size() -> Scalar:
-        rounding, tol = ROUNDING * jnp.finfo(value.dtype).eps * _size(task.layout, value, task.counting), task.tol
-        if to_the_end:  # regardless of the tolerance
-            tol = jnp.where(task.problem.discount > 0, tol, FEW / ROUNDING * rounding if task.bare else rounding)
-        # a residual that is rounding cannot fall further: ten steps suffice, instead of thousands for a slow climb
-        patience = jnp.where(bound.residual <= rounding, PATIENCE, longest)
-        halted: Any = Status.STALLED
-        if to_the_end and task.bare:  # in a sum of many terms more than a few units may remain
-            halted = jnp.where((bound.residual <= rounding) & ~(task.problem.discount > 0), Status.CONVERGED, halted)
-        code = jnp.where(since >= patience, halted, Status.RUNNING)
-        grew = bound.residual > GROWTH * jnp.maximum(best[1], rounding)
-        bounded = jnp.isfinite(best[0]) & (bound.error <= GROWTH * best[0])
-        grew &= ~bounded  # a better policy may leave a larger residual than one that stops at once
-        return converged(jnp.where(grew, Status.DIVERGED, code), tol)
-
-    if to_the_end:
-        return by_size()
-    # otherwise the size of V does not affect the status; a cond, because its result is not recomputed by later selects
-    matters = (since >= jnp.minimum(PATIENCE, longest)) | (bound.residual > GROWTH * best[1])
-    return jax.lax.cond(matters, by_size, lambda: converged(Status.RUNNING, task.tol))
-
-
-def tube_status(task: Any, state: Any, moved: Scalar, code: Scalar) -> Scalar:
-    """The status after a step; a tube in which nothing moved has converged, whatever the residual of a slow node.
-
-    The residual is relative to the node's own rate, the step to the fastest rate: it may be below the last place of V.
-    """
-    if not (task.constrained and task.method.relaxes and task.certificate in TO_THE_END):
-        return code
-    ends = (moved == 0) & (state.step >= 0) & (code != Status.NONFINITE) & ~(task.problem.discount > 0)
-    return jnp.where(ends, int(Status.CONVERGED), code).astype(code.dtype)
-
-
-def _size(layout: Layout, value: Field, counted: Mask | bool) -> Scalar:
-    """max |V| over the counted nodes."""
-    if not jnp.ndim(counted):  # all nodes count: no array of |V|
-        return jnp.maximum(layout.largest(value), -layout.least(value))
-    return layout.largest(jnp.where(counted, jnp.abs(value), 0))
-
-
-def booked(state: S, start: Scalar, bound: ErrorBound, code: Scalar, since: Scalar, **found: Any) -> S:
-    """The state after a step with its results; if these are not finite, the previous state with the step recorded.
-
-    Args:
-      state: the state before the step, with the bookkeeping of ``State``.
-      start: the first step of this chunk.
-      bound: the error bound after the step.
-      code: the status after the step.
-      since: the result of ``steps_since_best``.
-      found: other results for the state.
-    """
-    # counted and recorded even if it is undone: ``broken`` repeats that step
-    history = state.history.at[state.step - start].set(bound.residual)
-    old = dataclasses.replace(state, step=state.step + 1, since_best=since, code=code, history=history)
-    best = jnp.fmin(state.best, _measures(bound))  # fmin ignores NaN
-    new = dataclasses.replace(old, bound=bound, best=best, **found)
-    return jax.tree.map(lambda after, before: jnp.where(code == Status.NONFINITE, before, after), new, old)
-
-
-def _measures(bound: ErrorBound) -> jax.Array:
-    """Error and residual, (2,): a decrease of either is progress."""
-    return jnp.stack([bound.error, bound.residual])

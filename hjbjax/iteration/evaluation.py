@@ -82,6 +82,10 @@ class Evaluation(abc.ABC):
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """δ with δ = s + Σ_o w_o δ(x + o), exactly or approximately, (*grid), in the dtype of the equation."""
 
+    def relaxations(self, n: int) -> int | None:
+        """The number of relaxations of every node in n dimensions, if it only relaxes, otherwise None."""
+        return None
+
     def bytes_per_node(self, weights: int, word: int) -> int:
         """Memory per node in bytes, input included, for ``weights`` jumps of ``word`` bytes each."""
         return word * (2 * weights + 8)
@@ -107,6 +111,10 @@ class Sweeps(Evaluation):
         # saves half the memory; a rough correction has few digits anyway, and V + δ is computed in the dtype of V
         single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), equation)
         return relaxed(single, grid, self.count).astype(equation.source.dtype)
+
+    def relaxations(self, n: int) -> int:
+        """Two sweeps in every order of the axes, each worth a relaxation of every node."""
+        return self.count * 2**n
 
     def bytes_per_node(self, weights: int, word: int) -> int:
         """Weights and source twice in single precision, plain and skewed."""

@@ -6,10 +6,15 @@ uses its diagonal with the largest rate (monotone, a contraction), modified poli
 policy iteration (Howard; semismooth Newton) a linear solve. For games see ``methods``.
 
 The loop stops by the certificate of the value it returns, not by the size of a step; NaN is never convergence.
+
+A pass of the loop corrects the last evaluated value and evaluates the result: its policy, its bound and the status. The
+first pass evaluates the guess, without a correction. All passes are one program, since a program that only evaluates
+takes 0.7 s to compile.
 """
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import jax
@@ -19,19 +24,21 @@ from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import Rates, jump_rates
-from hjbjax.iteration import bellman, certificates, methods
+from hjbjax.iteration import bellman, certificates, damping, methods, progress
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
-from hjbjax.iteration.certificates import Certificate, ErrorBound, Iterate
+from hjbjax.iteration.certificates import TO_THE_END, Certificate, ErrorBound, Iterate
+from hjbjax.iteration.damping import Moves
 from hjbjax.iteration.evaluation import Evaluation, evaluate
 from hjbjax.iteration.grid_task import GridTask
 from hjbjax.iteration.methods import Method
-from hjbjax.problem.grid import Grid
+from hjbjax.iteration.progress import Progress, keep_finite
+from hjbjax.problem.grid import Grid, undivided
 from hjbjax.problem.problem import Problem, is_constrained
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.status import Status
 
-HISTORY = 256  # largest number of steps per chunk, whose residuals are recorded
+FEW = 4  # ``progress.ROUNDING`` of a solve that stores only V, whose steps are small at slow nodes
 
 
 @pytree_dataclass(static=("certificate", "has_lost", "bare", "mesh"))
@@ -131,17 +138,28 @@ class Task(GridTask):
         largest = self.layout.largest(jnp.where(self.counted, jnp.abs(value), 0))
         return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
 
+    @property
+    def every_rate(self) -> bool:
+        """True if no rate of the chain counts as rounding, because the discount bounds the value."""
+        return self.certificate is Certificate.ADDITIVE
+
     def equation(self, value: Field, policy: Greedy, fastest: Scalar | None = None) -> PolicyEquation:
         """The linear equation of a policy; ``fastest``, its largest Q + β, saves a pass if known."""
-        if self.certificate is Certificate.ADDITIVE:  # with a discount no rate counts as rounding
-            fastest = jnp.zeros((), value.dtype)
-        return bellman.policy_equation(self.on, value, policy, self.obstacles, fastest=fastest)
+        return bellman.policy_equation(
+            self.on, value, policy, self.obstacles, fastest=fastest, every_rate=self.every_rate
+        )
 
     def reply(self, value: Field, policy: Greedy) -> Greedy:
         """The inner player's best response to the outer player's policy."""
         return bellman.respond(
             self.on, value, self.obstacles.fixed, policy, lost=self.lost, first_order=self.first_order
         )
+
+    def size(self, value: Field) -> Scalar:
+        """The largest |V| at the counted nodes."""
+        if not jnp.ndim(self.counting):  # all nodes count: no array of |V|
+            return jnp.maximum(self.layout.largest(value), -self.layout.least(value))
+        return self.layout.largest(jnp.where(self.counting, jnp.abs(value), 0))
 
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source| at the counted nodes, in cost units."""
@@ -159,22 +177,27 @@ class Task(GridTask):
 
 @pytree_dataclass()
 class State:
-    """State of a solve: a value, its greedy policy, its certificate, and the bookkeeping of the loop."""
+    """State of a solve: the last evaluated value with its policy and bound, or the guess, and the record of the loop.
+
+    Args:
+      value: V, (*grid).
+      policy: the greedy policy at V.
+      fastest: the largest Q + β of the policy, per unit time; None if no rate counts as rounding.
+      bound: the bound on the error of V.
+      moves: the sizes of the last corrections.
+      progress: the number of evaluations, the status and the residuals.
+    """
 
     value: Field
     policy: Greedy
-    fastest: Scalar  # the policy's largest Q + β; zero if every rate counts, infinite before the initial evaluation
+    fastest: Scalar | None
     bound: ErrorBound
-    step: Scalar
-    best: jax.Array  # the least error and the least residual so far, (2,)
-    moves: certificates.Moves  # the sizes of the last steps
-    since_best: Scalar
-    code: Scalar
-    history: jax.Array  # residuals of this chunk, (HISTORY,), −1 for unused entries
+    moves: Moves
+    progress: Progress
 
 
-def begin(task: Task, guess: Nodes) -> State:
-    """The state before the evaluation of a guess; this is step −1 of ``run``, so that all steps are one program.
+def start(task: Task, guess: Nodes) -> State:
+    """The state of a guess, which the first pass of ``run`` evaluates.
 
     The guess is copied, since states are donated; ``spread`` copies it on several devices. Nothing is compiled here.
     """
@@ -186,36 +209,38 @@ def begin(task: Task, guess: Nodes) -> State:
     players = (None if task.bare else admissible for admissible in (task.problem.controls, task.problem.disturbances))
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
     policy = Greedy(xp.zeros(shape, dtype), *(tuple(xp.zeros(shape, dtype) for _ in range(m)) for m in inputs))
-    infinite, code = xp.asarray(xp.inf, dtype), xp.asarray(int(Status.RUNNING), xp.int32)
-    bound = ErrorBound(xp.asarray(-infinite), infinite, xp.zeros((), dtype), infinite, infinite)
-    counter, first = xp.zeros((), xp.int32), xp.full((), -1, xp.int32)
-    history, best = xp.full(HISTORY, -1, dtype), xp.stack([infinite] * 2)  # not NaN, which jax_debug_nans would report
-    moves = certificates.Moves(xp.stack([infinite] * 2), infinite, xp.ones((), dtype), counter)
-    return State(value, policy, infinite, bound, first, best, moves, counter, code, history)
+    moves = Moves(xp.full(2, xp.inf, dtype), xp.asarray(xp.inf, dtype), xp.ones((), dtype), xp.zeros((), xp.int32))
+    fastest = None if task.every_rate else xp.zeros((), dtype)
+    return State(value, policy, fastest, progress.no_bound(dtype, xp), moves, progress.no_progress(dtype, xp))
 
 
 def run(task: Task, state: State, until: Number) -> State:
-    """Step until the state is no longer running or ``until`` steps are done; at most ``HISTORY`` at a time."""
-    start = state.step  # the first index of this chunk's history
+    """Step until the state is not running or ``until`` values are evaluated; at most ``HISTORY`` at a time."""
+    chunk = state.progress.evaluations
 
     def step(state: State) -> State:
         # made loop-variant, otherwise XLA compiles a kernel for every scalar of every action that it can hoist
-        controls, grid, count = jax.lax.optimization_barrier((task.problem.controls, task.grid, state.step))
+        variant = task.problem.controls, task.grid, state.progress.evaluations
+        controls, grid, count = jax.lax.optimization_barrier(variant)
         on = altered(task.on, problem=altered(task.problem, controls=controls), grid=grid)
-        return _advance(dataclasses.replace(task, on=on), dataclasses.replace(state, step=count), start)
+        state = dataclasses.replace(state, progress=dataclasses.replace(state.progress, evaluations=count))
+        return _advance(dataclasses.replace(task, on=on), state, chunk)
 
-    state = jax.lax.while_loop(lambda at: (at.code == Status.RUNNING) & (at.step < until), step, state)
+    state = jax.lax.while_loop(lambda at: at.progress.is_running(until), step, state)
     if not task.by_defect:
         return state
-    return dataclasses.replace(state, policy=bellman.greedy(task.on, state.value, task.obstacles.fixed))
+    policy = bellman.greedy(task.on, state.value, task.obstacles.fixed)
+    # the next chunk continues with the defect of the steps, from which that of the actions may differ by rounding
+    return dataclasses.replace(state, policy=dataclasses.replace(policy, defect=state.policy.defect))
 
 
-def _advance(task: Task, state: State, start: Scalar) -> State:
-    """One step; it is undone if its numbers are not finite."""
+def _advance(task: Task, state: State, chunk: Scalar) -> State:
+    """One step, or the evaluation of the guess; it is undone if its numbers are not finite."""
     if task.bare:
-        return _relaxed(task, state, start)
+        return _relaxed(task, state, chunk)
     if task.by_defect:
-        return _relaxed_by_defect(task, state, start)
+        return _relaxed_by_defect(task, state, chunk)
+    first = _is_first(state)
     delta = _correction(task, state)
     if not task.scheme.monotone:
         delta = state.moves.share * delta
@@ -225,32 +250,34 @@ def _advance(task: Task, state: State, start: Scalar) -> State:
     moved = task.layout.largest(jnp.abs(change))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
+    moved = jnp.where(first, jnp.inf, moved)  # without a step there is no measure of the distance
     moves, distance = state.moves, moved
     if not task.scheme.monotone:
-        distance = jnp.where(task.is_chain, moved, certificates.distance(task, moves, moved, value))
-    policy, fastest, bound = _look(task, value, state.policy, moved=distance, first=state.step < 0)
+        rounding = FEW * jnp.finfo(value.dtype).eps * task.size(value)
+        distance = jnp.where(task.is_chain, moved, moves.distance(moved, rounding))
+    policy, fastest, bound = _evaluate(task, value, state.policy, moved=distance, first=first)
     if not task.scheme.monotone:
-        moves = certificates.moves_after(state, moved, certificates.turns_back(task.layout, change, policy.defect))
-    bound = dataclasses.replace(bound, error=jnp.where(_lacks_measure(task, state), jnp.inf, bound.error))
-    since = certificates.steps_since_best(state, bound)
-    code = certificates.tube_status(task, state, moved, certificates.judged(task, value, bound, state.best, since))
-    found = {"value": value, "policy": policy, "fastest": fastest, "moves": moves}
-    return certificates.booked(state, start, bound, code, since, **found)
+        moves = moves.after(moved, damping.turns_back(task.layout, change, policy.defect))
+    measured = state.progress.measure(bound, chunk)
+    code = status_after(task, value, bound, measured, moved)
+    after = State(value, policy, fastest, bound, moves, measured.judge(bound, code))
+    return keep_finite(code, after, dataclasses.replace(state, progress=after.progress))
 
 
-def _relaxed(task: Task, state: State, start: Scalar) -> State:
+def _relaxed(task: Task, state: State, chunk: Scalar) -> State:
     """One relaxation of every node, storing only V, with the bound on the value before it."""
     value = task.impose(state.value)  # a guess need not have the fixed values
     step, bound = certificates.of_relaxation(task.certificate, task.on, value)
-    since = certificates.steps_since_best(state, bound)
     # the bound on the next value would require an array of its own
-    code = certificates.judged(task, state.value, bound, state.best, since)
-    after = jnp.where(state.step < 0, value, task.impose(value + step))
-    code = certificates.tube_status(task, state, task.layout.largest(jnp.abs(after - state.value)), code)
-    return certificates.booked(state, start, bound, code, since, value=after)
+    first, measured = _is_first(state), state.progress.measure(bound, chunk)
+    after = jnp.where(first, value, task.impose(value + step))
+    moved = jnp.where(first, jnp.inf, task.layout.largest(jnp.abs(after - state.value)))
+    code = status_after(task, state.value, bound, measured, moved)
+    found = dataclasses.replace(state, value=after, bound=bound, progress=measured.judge(bound, code))
+    return keep_finite(code, found, dataclasses.replace(state, progress=found.progress))
 
 
-def _relaxed_by_defect(task: Task, state: State, start: Scalar) -> State:
+def _relaxed_by_defect(task: Task, state: State, chunk: Scalar) -> State:
     """One relaxation of every node by the previous defect, with the bound on the new value; stores no actions."""
     assert task.outflow is not None
     value = task.impose(state.value + _correction(task, state))
@@ -259,47 +286,104 @@ def _relaxed_by_defect(task: Task, state: State, start: Scalar) -> State:
     left = PolicyEquation(task.obstacles.clipped(defect / task.outflow, value), Rates((), ()))
     iterate = Iterate(task.layout, value, policy, left, task.obstacles, task.counting)
     bound = certificates.error_bound(task.certificate, iterate, discount=task.problem.discount)
-    since = certificates.steps_since_best(state, bound)
-    code = certificates.judged(task, value, bound, state.best, since)
-    after = certificates.booked(state, start, bound, code, since, value=value)
-    return dataclasses.replace(after, policy=policy)  # also for a step that is undone, since ``run`` recomputes it
+    measured = state.progress.measure(bound, chunk)
+    code = status_after(task, value, bound, measured)
+    found = dataclasses.replace(state, value=value, bound=bound, progress=measured.judge(bound, code))
+    after = keep_finite(code, found, dataclasses.replace(state, progress=found.progress))
+    return dataclasses.replace(after, policy=policy)  # also for a step that is undone, since no step follows
+
+
+def _is_first(state: State) -> jax.Array:
+    """True if the value is the guess, which has not been evaluated."""
+    return state.progress.evaluations == 0
+
+
+def status_after(task: Task, value: Field, bound: ErrorBound, measured: Progress, moved: Number = np.inf) -> Scalar:
+    """The status after an evaluation; later lines override earlier ones.
+
+    Args:
+      task: the task.
+      value: a value of the size of V, (*grid).
+      bound: the bound of the evaluated value.
+      measured: the record with this evaluation, and the least error and residual before it.
+      moved: the largest change of V; infinite if there was no step.
+    """
+    longest: Number = task.method.patience(undivided(task.grid))
+    climbs = task.constrained or task.method.relaxes
+    to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
+    if to_the_end:  # a front moves V at every node by the spacing times the slope, one step after the other
+        longest = jnp.maximum(longest, 100 + 4 * math.prod(task.layout.whole))
+    best, since = measured.best, measured.since_best
+
+    def converged(code: Any, tol: Scalar) -> Scalar:
+        code = jnp.where(bound.error <= tol, Status.CONVERGED, code)
+        return jnp.where(jnp.isfinite(bound.residual), code, Status.NONFINITE).astype(jnp.int32)
+
+    def by_size() -> Scalar:
+        rounding, tol = progress.ROUNDING * jnp.finfo(value.dtype).eps * task.size(value), task.tol
+        if to_the_end:  # regardless of the tolerance
+            few = FEW / progress.ROUNDING * rounding if task.bare else rounding
+            tol = jnp.where(task.problem.discount > 0, tol, few)
+        # a residual that is rounding cannot fall further: ten steps suffice, instead of thousands for a slow climb
+        patience = jnp.where(bound.residual <= rounding, progress.PATIENCE, longest)
+        halted: Any = Status.STALLED
+        if to_the_end and task.bare:  # in a sum of many terms more than a few units may remain
+            halted = jnp.where((bound.residual <= rounding) & ~(task.problem.discount > 0), Status.CONVERGED, halted)
+        code = jnp.where(since >= patience, halted, Status.RUNNING)
+        grew = bound.residual > progress.GROWTH * jnp.maximum(best[1], rounding)
+        bounded = jnp.isfinite(best[0]) & (bound.error <= progress.GROWTH * best[0])
+        grew &= ~bounded  # a better policy may leave a larger residual than one that stops at once
+        return converged(jnp.where(grew, Status.DIVERGED, code), tol)
+
+    if not to_the_end:
+        # the size of V does not affect the status; a cond, because its result is not recomputed by later selects
+        matters = (since >= jnp.minimum(progress.PATIENCE, longest)) | (bound.residual > progress.GROWTH * best[1])
+        return jax.lax.cond(matters, by_size, lambda: converged(Status.RUNNING, task.tol))
+    return _status_of_tube(task, moved, by_size())
+
+
+def _status_of_tube(task: Task, moved: Number, code: Scalar) -> Scalar:
+    """The status after a step; a tube in which nothing moved has converged, whatever the residual of a slow node.
+
+    The residual is relative to the node's own rate, the step to the fastest rate: it may be below the last place of V.
+    """
+    if not (task.constrained and task.method.relaxes and task.certificate in TO_THE_END):
+        return code
+    ends = (moved == 0) & (code != Status.NONFINITE) & ~(task.problem.discount > 0)
+    return jnp.where(ends, int(Status.CONVERGED), code).astype(code.dtype)
 
 
 def nonfinite_nodes(task: Task, state: State) -> jax.Array:
     """The nodes where value or defect are not finite in the step that a NONFINITE state undid, bool (*grid)."""
     if task.bare:
         return ~jnp.isfinite(bellman.relaxation(task.on, task.impose(state.value))[0])
-    state = dataclasses.replace(state, step=state.step - 1)
+    before = dataclasses.replace(state.progress, evaluations=state.progress.evaluations - 1)
+    state = dataclasses.replace(state, progress=before)
+    if task.by_defect:  # the defect is that of the undone step
+        state = dataclasses.replace(state, policy=bellman.greedy(task.on, state.value, task.obstacles.fixed))
     value = task.impose(state.value + _correction(task, state))
     rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost, first_order=task.first_order).defect
     return task.counted & ~(jnp.isfinite(value) & jnp.isfinite(rate))
 
 
-def _lacks_measure(task: Task, state: State) -> jax.Array:
-    """True before the first step if the error is measured by the size of a step, without a certificate."""
-    certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
-    return (state.step < 0) & ~(certified & jnp.asarray(task.is_chain))
-
-
 def _shift(task: Task, state: State) -> Scalar:
     """κ of the next correction, per unit time, with open ends."""
     assert task.outflow is not None
-    return methods.shift(task.layout.largest(task.outflow), state.step)
+    return methods.shift(task.layout.largest(task.outflow), jnp.maximum(state.progress.evaluations - 1, 0))
 
 
-def _look(
+def _evaluate(
     task: Task, value: Field, incumbent: Greedy, *, moved: Scalar, first: jax.Array
-) -> tuple[Greedy, Scalar, ErrorBound]:
+) -> tuple[Greedy, Scalar | None, ErrorBound]:
     """The greedy policy at a value, its largest Q + β, and the bound on the value's error."""
     problem = task.problem
     policy = bellman.greedy(
         task.on, value, task.obstacles.fixed, incumbent=incumbent, lost=task.lost, first_order=task.first_order
     )
-    if problem.stopping_cost is not None and not problem.is_game and task.certificate in certificates.TO_THE_END:
-        fixed = task.obstacles.fixed | first  # before the initial evaluation there are no actions to keep
+    if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
+        fixed = task.obstacles.fixed | first  # there are no actions to keep
         policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)
-    assert left.fastest is not None
     iterate = Iterate(task.layout, value, policy, left, task.obstacles, task.counting)
     known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
     bound = certificates.error_bound(task.certificate, iterate, **known)
@@ -313,7 +397,7 @@ def _look(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Look:
+class _At:
     """The view of a solve at one of its values that is passed to a method."""
 
     task: Task
@@ -344,7 +428,7 @@ class _Look:
             later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
             return evaluate(evaluation, task.asking(later).equation(state.value, state.policy), task.grid)
         if task.problem.is_game:
-            outer, goal = (state.value, state.policy), methods.inner_goal(state.bound.residual, state.best[1])
+            outer, goal = (state.value, state.policy), methods.inner_goal(state.bound.residual, state.progress.best[1])
             return methods.evaluated(task, *outer, evaluation, goal=goal, replies=replies) - state.value
         if task.shift is not None:  # a time step of length 1/κ: see ``solvers.order.sharpened``
             later = altered(task.problem, discount=task.problem.discount + task.shift)
@@ -355,18 +439,18 @@ class _Look:
 
 
 def _correction(task: Task, state: State) -> Field:
-    """The correction δ of the method, cost units, (*grid); zero in step −1, which only evaluates the guess."""
-    stay = jnp.zeros_like(state.value)
+    """The correction δ of the method, cost units, (*grid); zero for a guess, which has no policy."""
+    stay, first = jnp.zeros_like(state.value), _is_first(state)
     if task.method.relaxes:  # one pass, while a cond would take two
-        return jnp.where(state.step < 0, stay, _by_method(task, state))
-    return jax.lax.cond(state.step < 0, lambda: stay, lambda: _by_method(task, state))
+        return jnp.where(first, stay, _by_method(task, state))
+    return jax.lax.cond(first, lambda: stay, lambda: _by_method(task, state))
 
 
 def _by_method(task: Task, state: State) -> Field:
-    """The correction δ of the method in any step after −1."""
-    look = _Look(task, state)
+    """The correction δ of the method for an evaluated value."""
+    here = _At(task, state)
     if task.method.relaxes or task.outflow is None or task.certificate is Certificate.OPEN:
-        return task.method.correct(look)
+        return task.method.correct(here)
     return jax.lax.cond(  # with a traced discount: without a discount the policies of a tube have no value
-        jnp.asarray(task.problem.discount > 0), lambda: task.method.correct(look), look.relaxed
+        jnp.asarray(task.problem.discount > 0), lambda: task.method.correct(here), here.relaxed
     )

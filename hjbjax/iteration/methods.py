@@ -272,7 +272,7 @@ def shift(largest: Scalar, step: Scalar) -> Scalar:
     Each correction is then an implicit time step of length 1/κ. The equation with open ends has several solutions, of
     which the stable one is required, and policies that leave may have no finite value.
     """
-    dying = jnp.asarray(SHIFT, largest.dtype) ** -jnp.maximum(step, 0)
+    dying = jnp.asarray(SHIFT, largest.dtype) ** -step
     return jnp.where(step < SHIFTS, largest * dying, 0)
 
 

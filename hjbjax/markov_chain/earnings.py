@@ -44,7 +44,7 @@ def earned(task: Task, state: State) -> Earning | None:
     problem = task.problem
     # a certificate or a discount bounds the value, so V can fall indefinitely only without both
     bounded = task.certificate is not Certificate.NONE or problem.discount != 0
-    if bounded or problem.is_game or problem.cost is None or int(state.step) < 0:
+    if bounded or problem.is_game or problem.cost is None or not state.progress.has_begun:
         return None
     jumps, cost = jax.device_get(_rates_and_cost(task, state.policy.controls))
     # fixed nodes end the run: they are absorbing in the chain

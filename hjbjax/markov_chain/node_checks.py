@@ -43,7 +43,7 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
     clock, problem, grid, scheme = clock or Clock(), on.problem, on.grid, on.scheme
     actions = _actions(problem)
     # one compiled program for all schemes whose chain is correct by construction
-    chain = Upwind() if isinstance(scheme.chain, Upwind) else scheme.chain
+    chain = Upwind() if scheme.chain.is_proven else scheme.chain
     on = on.with_scheme(chain).on_grid(tabulated(on.grid))
     # x64 for 64-bit counts; the functions are still evaluated in ``dtype``
     with own_settings(x64=True):
@@ -206,7 +206,7 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, j
     lacking = correlated_noise.lacking(on, a)
     if lacking is not None:
         bad["correlation"] = lacking
-    if on.scheme != Upwind():  # a custom chain
+    if not on.scheme.chain.is_proven:
         links = [stencil.grid_links(on.grid, axis) for axis in range(on.grid.ndim)]
         short = [
             schemes.falls_short(on.scheme.chain, part[axis], stencil.noise_along(a, on.grid, axis), link)

@@ -26,7 +26,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
-from hjbjax.discretisation.schemes import Upwind
+from hjbjax.discretisation.schemes import Upwind, check_slopes
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import admissibility, memory, node_checks
@@ -120,6 +120,7 @@ def solve_batch(
         if not isinstance(lane, Problem):
             raise TypeError(f"solve_batch: lane {number} is {shown(lane)}; wanted only problems")
         check_arguments(lane, grid, method, scheme, tol)
+    check_slopes(scheme, "solve_batch: scheme")
     checks.check_indices(grid)
     kind = arguments.as_dtype(dtype)
     check_spacings(grid, kind)
@@ -368,7 +369,7 @@ def _iterate(
         for i, (state, code), residuals in zip(members, run.final, run.histories, strict=True):
             # a run that ended before its initial evaluation still contains the raw guess
             state = with_obstacles(tasks[i], state) if code in CUT else state
-            found[i] = state, code, np.concatenate(residuals)[: int(state.step) + 1]
+            found[i] = state, code, np.concatenate(residuals)[: int(state.progress.evaluations)]
     return found
 
 

@@ -86,7 +86,7 @@ class Run(Part, Protocol):
 
     @property
     def steps(self) -> int:
-        """The number of completed steps; 0 after the initial evaluation of a guess, −1 before it."""
+        """The number of completed steps; the evaluation of a guess is not a step."""
 
     @property
     def limit(self) -> float:
@@ -94,20 +94,20 @@ class Run(Part, Protocol):
 
     @property
     def longest(self) -> int:
-        """The largest number of steps in a chunk."""
+        """The largest number of passes in a chunk: steps, and the evaluation of a guess."""
 
     @property
     def bar(self) -> dict[str, Any]:
         """The options of its progress bar."""
 
     def compile(self) -> None:
-        """Call the jitted steps with zero steps."""
+        """Call the jitted passes without one."""
 
     def first_chunk(self, clock: Clock) -> int:
-        """The number of steps of the first chunk, before any is timed; zero means the initial evaluation only."""
+        """The number of passes of the first chunk, before any is timed."""
 
     def advance(self, count: int) -> Status:
-        """Take at most ``count`` steps and return the status; waits until they are done."""
+        """Make at most ``count`` passes and return the status; waits until they are done."""
 
     def between(self, status: Status, clock: Clock) -> Status:
         """Store results between two chunks, and before the first; return the status with which to continue."""
@@ -144,10 +144,10 @@ def drive(run: Run, clock: Clock) -> Status:
                     break
                 clock.phase = f"step {before + 1} on {run.name}"
                 status = run.advance(chunk)
-                clock.count(time.perf_counter() - began, max(run.steps - before, 1), run.nodes)
+                done = max(run.steps - before, 1)  # the evaluation of a guess takes less time than a step
+                clock.count(time.perf_counter() - began, done, run.nodes)
                 # the timing of a short chunk is inaccurate, so the next chunk is at most 8 times as long
-                steps = clock.steps_in(CHUNK_SECONDS, run.nodes)
-                chunk = int(np.clip(steps, 1, min(run.longest, 8 * max(chunk, 1))))
+                chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, run.nodes), 1, min(run.longest, 8 * done)))
                 if bar is not None:
                     run.show(bar)
         except KeyboardInterrupt:  # a second Ctrl-C, or a custom handler

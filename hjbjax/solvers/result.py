@@ -61,7 +61,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     # arrays from the device may be read-only
     arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
     arrays["value"][lost] = np.inf  # they stored a finite number above all others
-    idle = lost | np.asarray(task.obstacles.ended) | (int(state.step) < 0)  # no policy has been computed yet
+    idle = lost | np.asarray(task.obstacles.ended) | (not state.progress.has_begun)  # a guess has no policy
     for array in (arrays["policy"], arrays["disturbance"]):
         if array is not None:
             array[idle] = np.nan
@@ -70,7 +70,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
         enclosure=solution.enclosure,
         grid=grid,
         code=int(code),
-        steps=max(int(state.step), 0),
+        steps=state.progress.steps,
         isaacs_gap=gap,
         reached=reached,
         cut=leaving,
@@ -155,7 +155,7 @@ def _highest(settled: Settled) -> float:
 def _left(solution: Solution, settled: Settled) -> float:
     """The algebraic error of the iteration, cost units."""
     error = solution.error
-    known = float(settled.state.best[0]) if error is None else float(error)
+    known = float(settled.state.progress.best[0]) if error is None else float(error)
     return min(known, float(settled.task.tol))
 
 
@@ -199,8 +199,8 @@ def _assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
         value=state.value,
         policy=None if task.bare else policy,
         disturbance=xp.stack(disturbances, axis=-1) if problem.is_game and not task.bare else None,
-        code=state.code,
-        steps=state.step,
+        code=state.progress.code,
+        steps=state.progress.steps,
         enclosure=_enclosure(task, state, assumptions),
         grid=task.grid,
         **question(problem),
@@ -328,8 +328,8 @@ def _not_finite_message(task: Task, state: State, grid: Grid) -> str:
     """The message for NaN or infinity, with the place, found by repeating the step that caused it."""
     # the state holds the last finite value, which does not show where the fault began
     bad = np.asarray(_broken(task, state))
-    step = int(state.step)
-    when = "at the guess" if step == 0 else f"in step {step}"
+    steps = state.progress.steps
+    when = f"in step {steps}" if steps else "at the guess"
     kept = "the last finite value is kept"
     discount, left = float(np.asarray(task.problem.discount)), float(np.max(np.abs(state.policy.defect)))
     if 0 < discount < 1 and left > discount * float(np.finfo(np.float32).max):  # sweeps run in single precision
@@ -357,7 +357,7 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     if code is Status.NONFINITE:
         return _not_finite_message(task, state, grid)
     # the certificates that do not bound the error cannot promise that a smaller tolerance is within reach
-    best, tol = float(state.best[0]), float(task.tol)
+    best, tol = float(state.progress.best[0]), float(task.tol)
     certified = task.certificate not in (Certificate.NONE, Certificate.RESIDUAL, Certificate.OPEN)
     if code is Status.STALLED and np.isfinite(best) and certified:
         return within_reach(best)

@@ -26,7 +26,7 @@ def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
     task, assumptions = raised(settled.task, settled.assumptions, scheme)
     sharp = settled._replace(task=task, assumptions=assumptions, origin=settled)
     state, ended, residuals = iterate(sharp.running, settled.state.value, clock)
-    if int(state.step) < 0:
+    if not state.progress.has_begun:
         return settled._replace(code=ended)
     return sharp._replace(state=state, code=ended, residuals=residuals)
 

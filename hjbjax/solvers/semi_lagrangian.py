@@ -8,18 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import arcs as paths
-from hjbjax.discretisation import edges
-from hjbjax.discretisation.arcs import Arcs, Plan
-from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation import arcs, edges
+from hjbjax.discretisation.arcs import Arcs
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
+from hjbjax.discretisation.paths import Paths, Plan
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.discretisation.semi_lagrangian import PathScheme, SemiLagrangian
+from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
 from hjbjax.iteration import arc_iteration, bellman, certificates
 from hjbjax.iteration.arc_iteration import ArcState, ArcTask
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Sweeps
-from hjbjax.iteration.fixed_point import HISTORY
 from hjbjax.iteration.methods import Method
+from hjbjax.iteration.progress import HISTORY
 from hjbjax.markov_chain import memory, node_checks
 from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem.grid import Grid
@@ -55,13 +55,14 @@ def relaxations(method: Method | None, n: int) -> int:
       ValueError: the method uses the matrix of a chain, or coarser grids.
     """
     if method is None:
-        return Sweeps().count * 2**n
+        return Sweeps().relaxations(n)
     if method.coarsest is None and method.relaxes:
         return 1
-    # the number of relaxations in the sweeps of a chain, see ``Sweeps``
+    # the number of relaxations in the sweeps of a chain
     evaluation = method.filled(Sweeps()).evaluation
-    if method.coarsest is None and isinstance(evaluation, Sweeps):
-        return evaluation.count * 2**n
+    count = None if evaluation is None else evaluation.relaxations(n)
+    if method.coarsest is None and count is not None:
+        return count
     raise ValueError(
         f"solve: SemiLagrangian() follows arcs and does not have a matrix for {method!r}; use "
         "hjb.PolicyIteration(), PolicyIteration(Sweeps(...)) or ValueIteration(), on one grid"
@@ -78,7 +79,8 @@ def arc_bytes(grid: Grid, plan: Plan, dtype: DType) -> int:
 def solve_arcs_on_host(
     problem: Problem,
     grid: Grid,
-    scheme: PathScheme,
+    scheme: Scheme,
+    paths: Paths,
     kind: np.dtype,
     *,
     method: Method | None,
@@ -88,13 +90,13 @@ def solve_arcs_on_host(
     clock: Clock,
 ) -> Solution:
     """The solution by checks, arcs and steps, in this order, as far as the clock allows; may enable float64."""
-    scheme.check(problem, grid)
+    paths.check(problem, grid)
     times = relaxations(method, grid.ndim)
     on = Discretisation(problem, grid, Upwind(), kind)  # for checks that do not involve slopes
     start = None if guess is None else np.asarray(guess, kind)
     try:
         check_on_one_state(problem, grid, scheme)
-        plan = scheme.plan(problem, grid, kind)
+        plan = paths.plan(problem, grid, kind)
         # before all nodes are checked, which takes minutes on a grid that does not fit
         needed = memory.fitting(arc_bytes(grid, plan, kind), grid, max_memory)
         node_checks.check_values(on, clock)
@@ -119,7 +121,7 @@ class Followed(NamedTuple):
     """
 
     on: Discretisation
-    scheme: PathScheme
+    scheme: Scheme
     plan: Plan
     task: ArcTask
     state: ArcState
@@ -129,7 +131,7 @@ class Followed(NamedTuple):
 
 
 def _follow(
-    on: Discretisation, scheme: PathScheme, plan: Plan, tol: float, times: int, guess: Nodes | None, clock: Clock
+    on: Discretisation, scheme: Scheme, plan: Plan, tol: float, times: int, guess: Nodes | None, clock: Clock
 ) -> Followed:
     """Compute the arcs of a plan and iterate on them, as far as the clock allows."""
     task, reached = _prepare(on, plan, tol, times, clock)
@@ -137,9 +139,9 @@ def _follow(
     code = host_loop.drive(run, clock)
     task, state, problem = run.task, run.state, on.problem
     ends = problem.target is not None and problem.stopping_cost is None
-    if reached is None and int(state.step) >= 0 and ends and code not in CUT:
+    if reached is None and state.progress.has_begun and ends and code not in CUT:
         reached = np.asarray(_arriving(task, state.number))
-    residuals = np.concatenate(run.residuals)[: int(state.step) + 1]
+    residuals = np.concatenate(run.residuals)[: int(state.progress.evaluations)]
     return Followed(on, scheme, plan, task, state, code, reached, residuals)
 
 
@@ -219,7 +221,7 @@ def _traced(on: Discretisation, plan: Plan, *, running: bool) -> tuple[Arcs, bel
     """The arcs of a plan and the prescribed values at the nodes, in the dtype of the solve."""
     on = cast(on, on.dtype)
     obstacles = bellman.obstacles(on)
-    return paths.trace(on, plan, obstacles.fixed, running=running), obstacles
+    return arcs.trace(on, plan, obstacles.fixed, running=running), obstacles
 
 
 _surely_arriving = jax.jit(arc_iteration.surely_arriving)
@@ -262,17 +264,17 @@ class _Run(StatesInChunks):
     """The iteration of a task on arcs."""
 
     def __init__(self, task: ArcTask, guess: Nodes, limit: int):
-        super().__init__(task, arc_iteration.begin(task, guess), _run, guess, limit)
+        super().__init__(task, arc_iteration.start(task, guess), _run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
-        """Steps of the first chunk, in addition to the initial evaluation; a step evaluates every arc of a node."""
-        return int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
+        """Evaluations of the first chunk, of the guess and of some steps; each evaluates every arc of a node."""
+        return 1 + int(np.clip(FIRST_NODES / (self.nodes * self.task.arcs.count), 1, HISTORY - 1))
 
 
 def finish_arcs(followed: Followed) -> Solution:
     """The solution at the end of a run: values, first actions of the best arcs, bounds, and their description."""
     on, scheme, plan, task, state, code, reached, residuals = followed
-    problem, looked, counted = on.problem, int(state.step) >= 0, np.asarray(task.counted)
+    problem, looked, counted = on.problem, state.progress.has_begun, np.asarray(task.counted)
     state = jax.device_get(state)
     if reached is not None and not reached.all():
         warn_unreached(Reach(reached, reached), undiscounted=task.certificate is not Certificate.ADDITIVE)
@@ -281,11 +283,11 @@ def finish_arcs(followed: Followed) -> Solution:
     policy = np.array(np.asarray(plan.actions)[state.number // len(plan.legs)])
     leaving = None if code in CUT or not looked else _leaving(on, value, policy, task)
     policy[~counted | np.asarray(task.obstacles.ended) | (not looked)] = np.nan
-    best = float(state.best[0])
+    best = float(state.progress.best[0])
     message = within_reach(best) if code is Status.STALLED and np.isfinite(best) else code.message
     solution = solution_at_start(on, value, code)
     solution = dataclasses.replace(
-        solution, policy=policy, message=message, reached=reached, cut=leaving, steps=max(int(state.step), 0),
+        solution, policy=policy, message=message, reached=reached, cut=leaving, steps=state.progress.steps,
         residuals=residuals, enclosure=certificates.enclosure(task.certificate, state.bound) if looked else None,
         discrete=isinstance(problem.controls, Finite),
     )  # fmt: skip
@@ -300,7 +302,7 @@ def finish_replacement(followed: Followed) -> Solution:
     return dataclasses.replace(solution, message=f"{solution.message} {REASON}")
 
 
-def _said(solution: Solution, scheme: PathScheme) -> Solution:
+def _said(solution: Solution, scheme: Scheme) -> Solution:
     """The solution with the name of its scheme."""
     solution.stats["scheme"] = repr(scheme)
     return solution

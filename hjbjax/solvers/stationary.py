@@ -13,7 +13,6 @@ from jax.sharding import Mesh
 from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.discretisation.semi_lagrangian import PathScheme
 from hjbjax.iteration.methods import Method, check_method
 from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
@@ -47,7 +46,7 @@ def solve(
     grid: Grid,
     *,
     method: Method | None = None,
-    scheme: Scheme | PathScheme | None = None,
+    scheme: Scheme | None = None,
     tol: float = 1e-3,
     guess: Nodes | None = None,
     dtype: DType | None = None,
@@ -114,14 +113,15 @@ def solve(
       ('CONVERGED', True, True)
     """
     check_limits(max_steps, time_limit)
-    check_arguments(problem, grid, method, scheme, tol, guess, paths=True)
+    check_arguments(problem, grid, method, scheme, tol, guess)
     checks.check_indices(grid)  # also inside transformations, where the memory is not checked
     traced, free = is_traced(problem, grid, guess, tol), method is None
+    paths = None if scheme is None else scheme.paths
     if mesh is not None:
         known = choose(problem, grid, traced=traced, method=method, divided=True)
         mesh = checks.over_devices(mesh, "solve", problem, grid, *filter(None, [scheme]), known, traced=traced)
     if traced:
-        if isinstance(scheme, PathScheme):
+        if paths is not None:
             raise ValueError(
                 f"solve: {type(scheme).__name__}() runs at host level only; inside jit, vmap and grad use Upwind()"
             )
@@ -138,7 +138,7 @@ def solve(
         checkpoint, [problem], grid, resume=resume, caller="solve", together=clock.together, method=method,
         scheme=scheme, tol=tol, guess=guess, dtype=kind,
     )  # fmt: skip
-    if isinstance(scheme, PathScheme):
+    if scheme is not None and paths is not None:
         with (
             noting_interrupts(clock),
             host_loop.announce(clock),
@@ -147,7 +147,7 @@ def solve(
         ):
             clock.journal = kept and kept.journal()
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
-            solution = semi_lagrangian.solve_arcs_on_host(problem, grid, scheme, kind, clock=clock, **options)
+            solution = semi_lagrangian.solve_arcs_on_host(problem, grid, scheme, paths, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
     on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind)
@@ -208,20 +208,16 @@ def check_limits(max_steps: object, time_limit: object) -> None:
 
 
 def check_arguments(
-    problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None,
-    *, paths: bool = False,
-) -> None:  # fmt: skip
-    """Refuse arguments with which no solve can start, without evaluating the problem's functions.
-
-    ``paths``: schemes that follow paths are accepted.
-    """
+    problem: object, grid: object, method: object, scheme: object, tol: object, guess: object = None
+) -> None:
+    """Refuse arguments with which no solve can start, without evaluating the problem's functions."""
     if not isinstance(problem, Problem) or not isinstance(grid, Grid):
         kinds = f"{type(problem).__name__}, {type(grid).__name__}"
         raise TypeError(f"solve: got {kinds}; wanted a Problem and a Grid")
     if method is not None:
         check_method(method, "solve: method")
     if scheme is not None:
-        schemes.check_scheme(scheme, "solve: scheme", grid, stationary=True, paths=paths)
+        schemes.check_scheme(scheme, "solve: scheme", grid, stationary=True)
     arguments.positive(tol, "solve: tol", "in the units of the cost")
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
         raise ValueError(

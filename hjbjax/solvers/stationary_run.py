@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.iteration import fixed_point
-from hjbjax.iteration.fixed_point import HISTORY, State, Task
+from hjbjax.iteration.fixed_point import State, Task
+from hjbjax.iteration.progress import HISTORY
 from hjbjax.problem.grid import tabulated
 from hjbjax.problem.layouts import Lanes, Layout
 from hjbjax.problem.pytree import altered
@@ -30,7 +31,7 @@ MANY_NODES = 2_000_000  # above which the initial evaluation is its own chunk, s
 run = WideJit(fixed_point.run, donate_argnames="state")
 # if Python is called from the program, which may raise, the previous state must survive
 _run_kept = WideJit(fixed_point.run)
-_begin = jax.vmap(fixed_point.begin)
+_start = jax.vmap(fixed_point.start)
 
 
 @functools.partial(WideJit, static_argnames="over")
@@ -78,10 +79,10 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
         iteration.name += ", computing a guess"
         iteration.passing = most <= clock.max_steps
     status, state = host_loop.drive(iteration, clock), iteration.gathered()
-    # a run that ended before its initial evaluation still contains the raw guess
+    # a run that ended before it evaluated the guess still contains it as it was given
     if status is Status.NONFINITE or status in CUT:
         state = with_obstacles(task, state)
-    return state, status, np.concatenate(iteration.residuals)[: int(state.step) + 1]
+    return state, status, np.concatenate(iteration.residuals)[: int(state.progress.evaluations)]
 
 
 def with_obstacles(task: Task, state: State) -> State:
@@ -94,41 +95,47 @@ class StatesInChunks:
 
     Args:
       task: the task, with ``grid`` and ``tol``.
-      state: the initial state, at step −1, with ``step``, ``code``, ``history``, ``bound`` and ``value``.
-      run: a function from a task, a state and a number of steps to the new state; it may donate the state.
+      state: the state of the guess, with ``progress``, ``bound`` and ``value``.
+      run: a function from a task, a state and a total number of evaluations to the new state; may donate the state.
       guess: the value to fall back on.
       limit: the largest number of steps.
     """
 
-    longest = HISTORY  # a chunk records the residuals of this number of steps
+    longest = HISTORY  # a chunk records this number of residuals
     passing = False
 
     def __init__(self, task: Any, state: Any, run: Callable[..., Any], guess: Nodes, limit: int):
         self.task, self.guess, self.limit = task, guess, limit
         self.state = self.before = state
-        self.residuals, self.steps = [np.zeros(0)], -1
+        self.residuals, self.evaluations = [np.zeros(0)], 0
         self.nodes, self.name = task.grid.size, f"{' x '.join(map(str, task.grid.shape))} nodes"
         self.bar = {"desc": "solve", "unit": " steps"}
         self._run = run
 
+    @property
+    def steps(self) -> int:
+        """The number of completed steps; the evaluation of the guess is not a step."""
+        return max(self.evaluations - 1, 0)
+
     def compile(self) -> None:
-        """Call the program with zero steps: the state is at step −1, before the evaluation of the guess."""
-        self.before, self.state = self.state, self._run(self.task, self.state, -1)
+        """Call the program without an evaluation."""
+        self.before, self.state = self.state, self._run(self.task, self.state, 0)
 
     def advance(self, count: int) -> Status:
-        """Take at most ``count`` steps; the first of them also evaluates the guess."""
-        until = int(min(max(self.steps, 0) + count, self.limit))
+        """Evaluate at most ``count`` values: the guess, if it has not been evaluated, and one per step."""
+        until = int(min(self.evaluations + count, self.limit + 1))
         # in one assignment: an interrupt may come at any time, and the previous state may have been donated
         self.before, self.state = self.state, self._run(self.task, self.state, until)
-        status = Status(int(self.state.code))
+        status = Status(int(self.state.progress.code))
         self._note()
         return status
 
     def _note(self) -> None:
         """Record the residuals of the last chunk, once."""
-        done = int(self.state.step)
-        self.residuals.append(np.asarray(self.state.history)[: done - self.steps])
-        self.steps = done
+        progress = self.state.progress
+        done = int(progress.evaluations)
+        self.residuals.append(np.asarray(progress.history)[: done - self.evaluations])
+        self.evaluations = done
 
     def between(self, status: Status, clock: Clock) -> Status:
         """Record the residuals that an interrupt left unrecorded."""
@@ -148,21 +155,22 @@ class StatesInChunks:
         """Continue from a saved state.
 
         Raises:
-          ValueError: the arrays are not a state of this run, with one residual per step and one before the first.
+          ValueError: the arrays are not a state of this run, with one residual per evaluation.
         """
         residuals, *leaves = arrays
         check_alike(leaves, jax.tree.leaves(self.gathered()))
         # copied to the device, because a state is donated
         on_device = [jax.device_put(leaf, may_alias=False) for leaf in leaves]
         state = jax.tree.unflatten(jax.tree.structure(self.state), on_device)
-        check_alike([residuals], [np.broadcast_to(0.0, int(state.step) + 1)])
-        Status(int(state.code))
+        evaluations = int(state.progress.evaluations)
+        check_alike([residuals], [np.broadcast_to(0.0, evaluations)])
+        Status(int(state.progress.code))
         self.before = self.state = state
-        self.residuals, self.steps = [residuals], int(state.step)
+        self.residuals, self.evaluations = [residuals], evaluations
 
     def show(self, bar: Any) -> None:
-        """Advance the progress bar; the initial evaluation is not a step."""
-        bar.update(max(self.steps, 0) - bar.n)
+        """Advance the progress bar."""
+        bar.update(self.steps - bar.n)
         error, tol = float(self.state.bound.error), float(self.task.tol)
         bar.set_postfix_str(f"error {error:.2e}, tol {tol:.0e}", refresh=False)
 
@@ -176,28 +184,28 @@ class StationaryRun(StatesInChunks):
 
     def __init__(self, task: Task, guess: Nodes, limit: int):
         task = altered(task, on=altered(task.on, grid=tabulated(task.grid)))
-        super().__init__(task, fixed_point.begin(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
+        super().__init__(task, fixed_point.start(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
-        """Steps of the first chunk on this grid, before any is timed there, in addition to the initial evaluation.
+        """Evaluations of the first chunk on this grid, before any is timed there: the guess, and some steps.
 
-        The pace on a coarser grid predicts them; a finer one may exceed the cache, so half a chunk's time is planned.
-        The first chunk is a single step if steps take many passes over the nodes, and more of them on a finer grid.
+        The pace on a coarser grid predicts the steps; a finer one may exceed the cache, so half a chunk's time is
+        planned. There is a single step if steps take many passes over the nodes, and more of them on a finer grid.
         """
         evaluation = self.task.method.evaluation
-        # the initial evaluation is one pass over the nodes, a step with a linear solve hundreds, so it is timed
+        # the evaluation of the guess is one pass over the nodes, a step with a linear solve hundreds, so it is timed
         # separately
         if clock.per_node is None and self.nodes > MANY_NODES:
-            return 0
+            return 1
         # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: the time of a step
         # on a coarser grid does not predict them
         if self.task.problem.is_game or (evaluation is not None and not evaluation.rough):
-            return 1
+            return 2
         if clock.per_node is None:
             steps = FIRST_NODES / self.nodes
         else:
             steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), self.nodes)
-        return int(np.clip(steps, 1, HISTORY - 1))  # the initial evaluation takes one entry of the history
+        return 1 + int(np.clip(steps, 1, HISTORY - 1))
 
 
 class RunInParts(StationaryRun):
@@ -240,7 +248,7 @@ class Rows(NamedTuple):
     lanes: np.ndarray  # the lane of each row; −1 in padding rows
     tasks: Task
     states: State
-    before: np.ndarray  # the steps of each row before the last chunk
+    before: np.ndarray  # the evaluations of each row before the last chunk
 
 
 class LanesRun:
@@ -250,11 +258,11 @@ class LanesRun:
 
     def __init__(self, tasks: Task, starts: Array, limit: int, over: Lanes):
         count, self.name, self.over = len(starts), f"{len(starts)} lanes", over
-        states, lanes = _begin(tasks, starts), np.arange(over.filled(count))
+        states, lanes = _start(tasks, starts), np.arange(over.filled(count))
         if lanes.size > count:  # every device has the same number of rows
             (tasks, states), lanes = _take((tasks, states), lanes % count), np.where(lanes < count, lanes, -1)
-        self.rows = Rows(lanes, *over.spread((tasks, states)), np.full(lanes.size, -1))
-        self.limit, self.steps = limit, -1
+        self.rows = Rows(lanes, *over.spread((tasks, states)), np.zeros(lanes.size, int))
+        self.limit, self.steps = limit, 0
         self.final: list[Any] = [None] * count  # the last state and the status of each lane
         self.histories: list[list] = [[np.zeros(0)] for _ in range(count)]
 
@@ -264,43 +272,49 @@ class LanesRun:
         return self.rows.states.value.size
 
     def _run(self, until: np.ndarray) -> State:
-        """The states after this number of steps per row, or when the row is done."""
+        """The states after this number of evaluations per row, or when the row is done."""
         return _run_lanes(self.rows.tasks, self.rows.states, self.over.spread(until), self.over)
 
     def compile(self) -> None:
-        """Call the program with zero steps."""
+        """Call the program without an evaluation."""
         self.rows = self.rows._replace(states=self._run(self.rows.before))
 
     def first_chunk(self, clock: Clock) -> int:
-        """Steps of the first chunk: nothing has been timed yet."""
-        return int(np.clip(FIRST_NODES / self.nodes, 1, CHUNK))
+        """Evaluations of the first chunk: the guesses, and some steps, as nothing has been timed yet."""
+        return 1 + int(np.clip(FIRST_NODES / self.nodes, 1, CHUNK))
 
     def advance(self, count: int) -> Status:
-        """Take at most ``count`` steps in every row; the loop runs as long as its slowest lane."""
-        before = self.over.gathered(self.rows.states.step)
-        # an array: finished rows keep their number of steps
-        until = np.minimum(np.maximum(before, 0) + count, self.limit)
+        """Evaluate at most ``count`` values in every row; the loop runs as long as its slowest lane."""
+        before = self._evaluations()
+        # an array: finished rows keep their number of evaluations
+        until = np.minimum(before + count, self.limit + 1)
         self.rows = self.rows._replace(states=jax.block_until_ready(self._run(until)), before=before)
-        self.steps += max(int(np.max(self.over.gathered(self.rows.states.step) - before)), 1)
+        done = np.maximum(self._evaluations() - 1, 0) - np.maximum(before - 1, 0)
+        self.steps += max(int(np.max(done)), 1)
         return Status.RUNNING
+
+    def _evaluations(self) -> np.ndarray:
+        """The number of evaluations of each row."""
+        return self.over.gathered(self.rows.states.progress.evaluations)
 
     def between(self, status: Status, clock: Clock) -> Status:
         """Remove the finished lanes; CONVERGED when all are done; a lane that is cut short ends them all."""
         rows = self.rows
         if not rows.lanes.size:
             return status
-        codes, steps, history = self.over.gathered((rows.states.code, rows.states.step, rows.states.history))
-        going = (codes == Status.RUNNING) & (steps < self.limit) & (status is Status.RUNNING)
+        progress = self.over.gathered(rows.states.progress)
+        codes, counts, history = progress.code, progress.evaluations, progress.history
+        going = (codes == Status.RUNNING) & (counts <= self.limit) & (status is Status.RUNNING)
         live = [row for row, lane in enumerate(rows.lanes) if lane >= 0 and self.final[lane] is None]
         for row in live:
-            self._note(rows.lanes[row], history[row, : steps[row] - rows.before[row]], steps[row] + 1)
+            self._note(rows.lanes[row], history[row, : counts[row] - rows.before[row]], counts[row])
         ended = [row for row in live if not going[row]]
         if ended:
             on_host = self.over.gathered(rows.states)
             for row in ended:
                 # copied, because a view would keep the arrays of all lanes alive
                 last = jax.tree.map(lambda leaf, row=row: leaf[row].copy(), on_host)
-                own = Status(int(last.code))
+                own = Status(int(last.progress.code))
                 cut = status if status is not Status.RUNNING else Status.MAX_STEPS
                 self.final[rows.lanes[row]] = last, own if own is not Status.RUNNING else cut
         self._narrow(np.flatnonzero(going & (rows.lanes >= 0)))
@@ -313,7 +327,7 @@ class LanesRun:
 
     def _narrow(self, left: np.ndarray) -> None:
         """Continue with these rows only, if this halves the work."""
-        rows, over, before = self.rows, self.over, self.over.gathered(self.rows.states.step)
+        rows, over, before = self.rows, self.over, self._evaluations()
         # powers of two, since every width is compiled separately: a thousand lanes take at most eleven programs
         width = over.filled(1 << (left.size - 1).bit_length()) if left.size else 0
         if width < rows.lanes.size:
@@ -327,7 +341,7 @@ class LanesRun:
 
     def show(self, bar: Any) -> None:
         """Move the progress bar."""
-        bar.update(max(self.steps, 0) - bar.n)
+        bar.update(self.steps - bar.n)
 
     passing = False
 

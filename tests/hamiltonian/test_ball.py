@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from pieces import NODES, gain, random_pieces
+from piecewise_gains import NODES, gain, random_pieces
 from scipy.optimize import minimize
 from systems import SEEDS
 

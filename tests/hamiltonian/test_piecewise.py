@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from pieces import NODES, gain, random_pieces
+from piecewise_gains import NODES, gain, random_pieces
 from systems import SEEDS
 
 from hjbjax.hamiltonian.piecewise import Kinked, piecewise_input, piecewise_pair

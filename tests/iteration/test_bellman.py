@@ -237,23 +237,28 @@ def test_the_source_is_the_residual_and_the_weights_are_the_chain(kind, seed):
 
 
 @jitted
-def _told(problem, grid, value, policy, obstacles, fastest):
+def _with_rate(problem, grid, value, policy, obstacles, fastest):
     return bellman.policy_equation(upwind(problem, grid), value, policy, obstacles, fastest=fastest)
+
+
+@jitted
+def _with_every_rate(problem, grid, value, policy, obstacles):
+    return bellman.policy_equation(upwind(problem, grid), value, policy, obstacles, every_rate=True)
 
 
 @pytest.mark.parametrize("kind", ["none", "matrix"])
 @given(seed=SEEDS)
 @settings(max_examples=6)
-def test_an_equation_tells_the_fastest_rate_and_may_be_told_it(kind, seed):
+def test_an_equation_returns_the_fastest_rate_and_accepts_it(kind, seed):
     rng = np.random.default_rng(seed)
     problem, grid = random_question(rng, kind)
     obstacles, value = random_rules(rng, grid), rng.normal(size=grid.shape)
     policy, equation = jax.device_get(_equation(problem, grid, value, obstacles))
     generator = chain.generator(problem, grid, np.stack(policy.controls, axis=-1)).toarray()
     assert equation.fastest == pytest.approx(np.max(-np.diag(generator)) + problem.discount, rel=1e-12)
-    again = _told(problem, grid, value, policy, obstacles, equation.fastest)
+    again = _with_rate(problem, grid, value, policy, obstacles, equation.fastest)
     np.testing.assert_allclose(again.source, equation.source, rtol=1e-12, atol=1e-15)
-    slow = _told(problem, grid, value, policy, obstacles, np.inf)
+    slow = _with_rate(problem, grid, value, policy, obstacles, np.inf)
     assert not np.any(slow.weights.total())  # where all drift counts as rounding, nothing moves
 
 
@@ -262,10 +267,11 @@ def test_every_rate_counts_where_none_is_rounding():
     grid = Grid([0.0], [1.0], (5,))
     policy = bellman.Greedy(jnp.ones(5), (jnp.zeros(5),), ())
     obstacles, leaving = free_rules(grid), np.array([4e-10, 4e-10, 4e-10, 4e6, 0]) + 1e-9
-    found = _told(problem, grid, jnp.zeros(5), policy, obstacles, 0.0)
+    found = _with_every_rate(problem, grid, jnp.zeros(5), policy, obstacles)
+    assert found.fastest is None
     np.testing.assert_allclose(found.source, 1 / leaving, rtol=1e-12)
     np.testing.assert_allclose(found.weights.total(), 1 - 1e-9 / leaving, rtol=1e-7)
-    slow = _told(problem, grid, jnp.zeros(5), policy, obstacles, 4e6)  # beside this one the others are rounding
+    slow = _with_rate(problem, grid, jnp.zeros(5), policy, obstacles, 4e6)  # beside this one the others are rounding
     np.testing.assert_allclose(slow.source[:3], 1 / 4e6, rtol=1e-12)
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import types
 from fractions import Fraction
 
 import jax
@@ -322,26 +321,3 @@ def test_without_cost_and_discount_constraints_supply_the_value(seed):
     assert gap.residual <= 1e-14
     worse, _ = bounds_of(Certificate.NONE, problem, grid, value + np.where(np.arange(7) == 3, 0.5, 0), obstacles)
     assert worse.residual >= 0.01
-
-
-@pytest.mark.parametrize(("turned", "shares"), [(True, [0.5, 0.25, 0.125]), (False, [1.0])])
-def test_corrections_that_do_not_shrink_are_halved_where_they_turn_back(turned, shares):
-    """Once per six equal steps and at most three times; steps that continue in one direction are taken whole."""
-    moves = certificates.Moves(jnp.full(2, jnp.inf), jnp.inf, jnp.ones(()), jnp.zeros((), int))
-    found = []
-    for step in range(30):
-        state = types.SimpleNamespace(moves=moves, step=step)
-        moves = certificates.moves_after(state, moves.share * 1e-3, jnp.asarray(turned))
-        found.append(float(moves.share))
-    assert list(dict.fromkeys(found[8:])) == shares  # in order, each once
-    onwards = types.SimpleNamespace(moves=dataclasses.replace(moves, since=100), step=31)
-    assert float(certificates.moves_after(onwards, moves.share * 1e-3, False).share) == min(2 * shares[-1], 1)
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_correction_turns_back_where_v_changed_most(sign):
-    grid = Grid([0.0], [1.0], (5,))
-    change = sign * jnp.array([0.1, 1.0, 0.8, 0.1, 0.0])
-    onwards = sign * jnp.array([-9.0, 0.2, -0.1, -9.0, -9.0])  # elsewhere V may ask for what it likes
-    assert not certificates.turns_back(grid.layout, change, onwards)
-    assert certificates.turns_back(grid.layout, change, -onwards)

@@ -110,7 +110,7 @@ def test_in_a_batch_only_the_lane_that_earns():
 
 @pytest.mark.parametrize("certificate", list(Certificate))
 def test_without_a_certificate_no_tolerance_is_promised(certificate):
-    task = SimpleNamespace(certificate=certificate, tol=1e-3)
-    message = result._message(Status.STALLED, task, SimpleNamespace(best=np.array([0.4, 0.4])), GRID)
+    task, progress = SimpleNamespace(certificate=certificate, tol=1e-3), SimpleNamespace(best=np.array([0.4, 0.4]))
+    message = result._message(Status.STALLED, task, SimpleNamespace(progress=progress), GRID)
     assert ("a tolerance of 0.8 is within reach" in message) == (certificate.value[:4] == "from")
     assert ("no certificate bounds" in message) == (certificate.value[:4] != "from")

@@ -58,7 +58,7 @@ def told_over_needed(problem, grid, method):
         on = Discretisation(problem, grid, hjb.Upwind(), np.float64)
         options = {"method": method, "tol": 1e-3, "assumptions": assumptions_of(on)}
         task = jax.eval_shape(lambda on: prepare(on, **options), on)
-        state = jax.eval_shape(fixed_point.begin, task, jax.ShapeDtypeStruct(grid.shape, np.float64))
+        state = jax.eval_shape(fixed_point.start, task, jax.ShapeDtypeStruct(grid.shape, np.float64))
         found = stationary_run.run.lower(task, state, 1).compile().memory_analysis()
     together = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
     return memory.peak_bytes(problem, grid, method, np.float64) / (together - found.alias_size_in_bytes)
@@ -237,7 +237,7 @@ def test_the_estimate_is_near_what_the_compiler_reports(method):
     with jax.enable_x64(True):
         on = Discretisation(PROBLEM, grid, hjb.Upwind(), np.float64)
         task, _, _ = setup.prepare_on_host(on, method=method, tol=1e-3)
-        state = jax.eval_shape(fixed_point.begin, task, jnp.zeros(grid.shape))
+        state = jax.eval_shape(fixed_point.start, task, jnp.zeros(grid.shape))
         analysis = jax.jit(fixed_point.run).lower(task, state, 1).compile().memory_analysis()
     peak = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes
     estimate = memory.peak_bytes(PROBLEM, grid, method, np.float64)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from questions import GRID, U, accepted, in_disc, refused
+from small_problems import GRID, U, accepted, in_disc, refused
 
 from hjbjax import Box, Finite, Grid, Problem
 from hjbjax.discretisation import correlated_noise, stencil

@@ -98,9 +98,9 @@ def upon(monkeypatch):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """``calls(act, at)``: act at the end of that call of the compiled run; the shapes and ends of all calls.
+    """``calls(act, at)``: act at the end of that call of the compiled run; the shapes and evaluations of all calls.
 
-    The first call on a grid, up to step −1, compiles; the others are chunks.
+    The first call on a grid compiles, and evaluates nothing; the others are chunks.
     """
     first, run = StationaryRun.first_chunk, stationary_run.run
 
@@ -311,7 +311,7 @@ def test_on_a_coarser_grid_its_answer_comes_back_on_the_finest(calls, act, statu
     assert solution.status is status
     assert {shape for shape, _ in made} == {coarse.shape}
     assert "on 25 nodes" in solution.message
-    once = hjb.solve(question(), coarse, max_steps=made[-1][1], throw=False, scheme=hjb.Upwind())
+    once = hjb.solve(question(), coarse, max_steps=made[-1][1] - 1, throw=False, scheme=hjb.Upwind())
     np.testing.assert_allclose(solution.value[::2], once.value, rtol=1e-12)
     np.testing.assert_allclose(solution.value[1::2], (once.value[:-1] + once.value[1:]) / 2, rtol=1e-12)
 
@@ -335,7 +335,7 @@ def test_during_the_compilation_of_the_steps(calls, act, status):
     game = hjb.Problem(push, effort, U, disturbances=both, discount=1.0, target=disc, exit_cost=3.0)
     made = calls(act, at=0)
     solution = hjb.solve(game, GRID, throw=False, scheme=hjb.Upwind())
-    assert (solution.status, made) == (status, [((25,), -1)])
+    assert (solution.status, made) == (status, [((25,), 0)])
     assert solution.value[12] == 3.0  # what is given is put in
     assert solution.isaacs_gap is None
     assert np.all(np.isnan(solution.disturbance))
@@ -351,13 +351,13 @@ def test_a_step_that_would_come_too_late_is_not_begun(calls, monkeypatch):
 
     made = calls(None, at=NEVER)
     whole = hjb.solve(question(), GRID, scheme=hjb.Upwind())
-    assert [until for _, until in made][:2] == [-1, 0]
+    assert [until for _, until in made][:2] == [0, 1]
     count = Clock.count
     monkeypatch.setattr(Clock, "count", lambda clock, *rest: (count(clock, *rest), slow(clock)))
     made = calls(None, at=NEVER)
     solution = hjb.solve(question(), GRID, throw=False, scheme=hjb.Upwind())
     assert solution.status is TIME_LIMIT
-    assert [until for _, until in made] == [-1, 0]
+    assert [until for _, until in made] == [0, 1]
     assert solution.steps == 0
     lower, upper = solution.bounds  # the look was taken
     assert np.all(lower <= whole.value)

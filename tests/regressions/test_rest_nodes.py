@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import problem
 
 import hjbjax as hjb
 
@@ -225,3 +226,9 @@ def test_a_game_that_may_go_on_at_no_cost(exit_cost):
         value = np.where(held, exit_cost, value + 0.07 * best)
     assert solution.status is hjb.Status.CONVERGED
     assert np.max(np.abs(solution.value - value)) <= 1e-3
+
+
+def test_rest_where_every_action_costs_the_same():
+    """At the origin u = 0 rests at no cost, though the cost does not favour it."""
+    odd = hjb.Grid([-1.0, -2.0], [1.0, 2.0], (9, 11))
+    assert hjb.solve(problem(discount=0.0), odd, tol=1e-2, scheme=hjb.Upwind()).value[4, 5] == 0.0

@@ -180,3 +180,41 @@ def test_a_tube_ends_where_nothing_moves_and_not_before(method, dtype, close):
     found = hjb.solve(problem, hjb.Grid([-1.0], [1.2], (61,)), scheme=hjb.Upwind(), method=method, dtype=dtype)
     assert found.status.name == "CONVERGED"
     assert found.value[14] == pytest.approx(-0.286750085349, abs=close)  # by value iteration in NumPy
+
+
+def along(x, u):
+    return jnp.stack([u[0], jnp.ones_like(u[0])])
+
+
+def block(x):
+    """Signed distance to the square |x|, |y| ≤ 1: ≤ 0 inside."""
+    return jnp.maximum(jnp.abs(x[0]), jnp.abs(x[1])) - 1
+
+
+def minus_block(x):
+    return -block(x)
+
+
+BOAT = hjb.Grid([-3.0, -3.0], [3.0, 3.0], (25, 25))  # nodes at multiples of ¼
+
+
+def test_reach_tube_of_the_floating_boat():
+    """The infimum over time of l: the largest solution, reached from ψ; from zero the iteration stays at zero."""
+    problem = hjb.Problem(along, controls=hjb.Box([-1.0], [1.0]), stopping_cost=block)
+    solution = hjb.solve(problem, BOAT, tol=1e-6, scheme=hjb.Upwind())
+    x, y = np.moveaxis(BOAT.nodes(), -1, 0)
+    level = np.maximum(np.abs(x), np.abs(y)) - 1
+    assert np.all(solution.value <= level + 1e-12)
+    assert np.all(solution.value[(np.abs(x) <= 0.5) & (y <= 1)] <= 1e-9)
+    past = (y >= 2) & (np.abs(x) < y)
+    np.testing.assert_allclose(solution.value[past], (y - 1)[past], atol=1e-9)
+
+
+def test_avoid_tube_of_the_floating_boat():
+    """The supremum over time of −l: the smallest solution, reached from g; from zero nothing would be safe."""
+    problem = hjb.Problem(along, controls=hjb.Box([-1.0], [1.0]), running_max=minus_block)
+    solution = hjb.solve(problem, BOAT, tol=1e-6, scheme=hjb.Upwind())
+    x, y = np.moveaxis(BOAT.nodes(), -1, 0)
+    level = 1 - np.maximum(np.abs(x), np.abs(y))
+    assert np.all(solution.value >= level - 1e-12)
+    assert np.all(solution.value[(y > 1) | (np.abs(x) > 1.5)] < 0)  # past the square, or beside it

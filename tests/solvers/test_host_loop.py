@@ -63,16 +63,16 @@ def test_converged_history_has_one_residual_a_step_and_one_for_the_guess():
 
 @pytest.fixture
 def asked(monkeypatch):
-    """Up to which step the driver runs, call by call."""
-    steps, run = [], stationary_run.run
+    """The number of evaluations up to which the driver runs, call by call."""
+    counts, run = [], stationary_run.run
 
     def watched(task, state, until):
-        steps.append(int(until))
+        counts.append(int(until))
         return run(task, state, until)
 
     monkeypatch.setattr(stationary_run, "run", watched)
     monkeypatch.setattr(stationary_run, "_run_kept", watched)  # where Python is called on the way
-    return steps
+    return counts
 
 
 def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
@@ -86,8 +86,8 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
         clock.per_node = per_node
         asked.clear()
         state, code, residuals = stationary_run.iterate(task, jnp.zeros(GRID.shape), clock)
-        assert asked[:2] == [-1, first]  # one call that compiles, and the first chunk
-        assert (code, int(state.step)) == (hjb.Status.MAX_STEPS, 300)
+        assert asked[:2] == [0, 1 + first]  # one call that compiles, and the first chunk
+        assert (code, state.progress.steps) == (hjb.Status.MAX_STEPS, 300)
         histories.append(residuals)
     assert histories[0].shape == (301,)
     assert np.all(np.diff(histories[0]) < 0)  # value iteration is a contraction
@@ -102,7 +102,7 @@ def test_a_first_chunk_is_as_long_as_coarser_grids_tell(asked):
 def test_where_nothing_is_known_a_first_chunk_is_short(asked, method, first):
     """Of one step where a step may take many passes over the nodes."""
     hjb.solve(question(), GRID, method=method, scheme=hjb.Upwind())
-    assert asked[1] == first
+    assert asked[1] == 1 + first
 
 
 @pytest.mark.parametrize("steps", [1, 7])
@@ -182,6 +182,24 @@ def test_overflow_stops_with_the_last_finite_value():
     assert np.all(np.isfinite(solution.value))
     assert solution.residuals.shape == (solution.steps + 1,)
     assert not np.isfinite(solution.residuals[-1])
+
+
+@pytree_dataclass()
+class Burst:
+    """A cost that is NaN for one control."""
+
+    center: float
+
+    def cost(self, x, u):
+        return x @ x + jnp.where(jnp.abs(u[0] - self.center) < 1e-3, jnp.nan, u[0] ** 2)
+
+
+def test_nan_during_the_steps_is_not_convergence():
+    points = np.linspace(-1.0, 1.0, 41)  # more than the checks before a solve try: they pass over the fourth
+    hidden = question(cost=Burst(points[3]).cost, controls=hjb.Finite(points[:, None]))
+    with pytest.raises(hjb.SolveError, match="NONFINITE") as caught:
+        hjb.solve(hidden, GRID, scheme=hjb.Upwind())
+    assert np.all(np.isfinite(caught.value.solution.value))
 
 
 @pytest.fixture

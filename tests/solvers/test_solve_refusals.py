@@ -164,6 +164,29 @@ def test_correlated_noise_without_a_chain():
     )  # the advice is good
 
 
+# --- other arguments ---
+
+
+@pytest.mark.parametrize("tol", ["1e-3", None])
+def test_tolerance_that_is_no_number(tol):
+    refusal((ValueError, TypeError), "tol", repr(tol), tol=tol)
+
+
+def test_guess_that_is_no_array_of_numbers():
+    refusal((ValueError, TypeError), "guess", guess="zeros")
+    refusal((ValueError, TypeError), "guess", guess=np.zeros(GRID.shape, complex) + 1j)
+
+
+@pytest.mark.parametrize("seconds", ["5"])
+def test_time_limit_that_is_no_number(seconds):
+    refusal((ValueError, TypeError), "time_limit", repr(seconds), "> 0", time_limit=seconds)
+
+
+@pytest.mark.parametrize("dtype", ["flaot64"])
+def test_unknown_dtype(dtype):
+    refusal((ValueError, TypeError), "dtype", repr(dtype), "float64", "float32", dtype=dtype)
+
+
 # --- memory ---
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from questions import GRID, U, accepted, drift, in_disc, refused
+from small_problems import GRID, U, accepted, drift, in_disc, refused
 
 from hjbjax import Grid, Problem
 from hjbjax.discretisation.schemes import Upwind

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from questions import U, drift, refused
+from small_problems import U, drift, refused
 
 import hjbjax as hjb
 from hjbjax import zoo

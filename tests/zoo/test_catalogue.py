@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.problem.sets import Ball, Finite
 from hjbjax.tracing import components
@@ -215,3 +216,13 @@ def test_a_misspelt_parameter_is_answered_with_the_cure(name):
         TypeError, match=rf"{name}\(\) got an unexpected keyword argument '{first}x': did you mean {first}"
     ):
         function(**{f"{first}x": 1.0})
+
+
+@pytest.mark.parametrize("change", [{"mass": 2.0}, {"mass": 3.5}])
+def test_changing_a_zoo_parameter_compiles_nothing(change, caplog):
+    shape = (20, 21)
+    hjb.solve(*zoo.pendulum(shape=shape), tol=1.0, scheme=hjb.Upwind())
+    with jax.log_compiles(True), caplog.at_level("WARNING"):
+        hjb.solve(*zoo.pendulum(shape=shape, **change), tol=1.0, scheme=hjb.Upwind())
+    compiled = [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]
+    assert compiled == []

@@ -171,7 +171,7 @@ def test_a_solve_takes_twelve_bytes_a_node_beyond_the_value(n, count, problem):
     with jax.enable_x64(False):
         on = Discretisation(problem, grid, hjb.Upwind(), kind)
         task, *_ = setup.prepare_on_host(on, method=BARE, tol=1e-3)
-        state = jax.eval_shape(fixed_point.begin, task, jax.ShapeDtypeStruct(grid.shape, kind))
+        state = jax.eval_shape(fixed_point.start, task, jax.ShapeDtypeStruct(grid.shape, kind))
         taken = peak(stationary_run.run.lower(task, state, 1)) / grid.size
     assert taken <= 4 + (8 if n > 4 else 12) + 0.2
     # and where it began, which is kept until the end

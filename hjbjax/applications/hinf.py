@@ -136,6 +136,8 @@ def hinf_level(
       >>> abs(level.gamma / 0.5**0.5 - 1) < 0.02
       True
     """
+    if not isinstance(grid, Grid):
+        raise TypeError(f"hinf_level: got {type(grid).__name__} for the grid, wanted a Grid")
     settling = Settling(inner, settle, horizon, scheme, time_limit)
     _check_rule(problem_of_gamma, lo, hi, tol, settling)
     trials: dict[float, Trial] = {}

@@ -58,7 +58,7 @@ def reach(
       >>> bool(solution.value_at(0.0, [1.45]) <= 0), bool(solution.value_at(0.0, [1.55]) <= 0)
       (True, False)
     """
-    inside = as_partial(target, "reach: target")
+    inside = _distance(target, "reach: target")
     # for a tube, stopping at any s pays l, so V ≤ l; for a set only the end pays l
     stop, end = (inside, None) if tube else (None, inside)
     return Problem(
@@ -95,7 +95,7 @@ def avoid(
     Returns:
       The problem; −V is the least distance that the control can guarantee.
     """
-    depth = jax.tree_util.Partial(_negative, as_partial(obstacle, "avoid: obstacle"))
+    depth = jax.tree_util.Partial(_negative, _distance(obstacle, "avoid: obstacle"))
     # −l is largest where the path is deepest in the obstacle, and the running maximum stores it, so V ≥ −l; for a set
     # only the end counts
     most, end = (depth, None) if tube else (None, depth)
@@ -135,7 +135,7 @@ def reach_avoid(
       The problem; V has the units of the distances.
     """
     # Partials keep the numbers of the distances as leaves, so that another radius does not recompile
-    inside, hit = as_partial(target, "reach_avoid: target"), as_partial(obstacle, "reach_avoid: obstacle")
+    inside, hit = _distance(target, "reach_avoid: target"), _distance(obstacle, "reach_avoid: obstacle")
     depth = jax.tree_util.Partial(_negative, hit)
     # max{·, −o} is the outer operation, so l ≤ 0 inside the obstacle does not count; it is a running maximum for a set
     # as well, because the obstacle counts at all times
@@ -226,6 +226,14 @@ def _admissible(space: Any, name: str) -> Box | Ball:
     if not (hasattr(space, "lo") and hasattr(space, "hi")):
         raise ValueError(f"{name}: got a {type(space).__name__}, wanted a box, with lo and hi, or a ball about zero")
     return Box(np.asarray(space.lo, float), np.asarray(space.hi, float))
+
+
+def _distance(function: Callable | None, name: str) -> jax.tree_util.Partial:
+    """A signed distance, which must be a function."""
+    held = as_partial(function, name)
+    if held is None:
+        raise TypeError(f"{name}: got None, wanted a function of one state")
+    return held
 
 
 def _drift(drift: Callable, forward: bool, time_dependent: bool) -> Callable:

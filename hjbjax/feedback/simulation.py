@@ -27,6 +27,7 @@ from hjbjax.tracing.closures import OF_ACTION, OF_STATE, holds_tracers, opened, 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
 
 INTERVALS = 200  # of the output, by default
+MOST_INTERVALS = 10**7  # 80 MB per state
 
 _jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # overwrites the rows of all intervals in place
 
@@ -338,11 +339,13 @@ def _times(duration: float, steps: int | None, hold: float | None) -> np.ndarray
     """The output times, or the sampling times under a hold."""
     if hold is None:
         count = INTERVALS if steps is None else arguments.count(steps, "simulate: steps")
+        if count > MOST_INTERVALS:
+            raise ValueError(f"simulate: steps = {arguments.shown(steps)}, wanted at most 1e7")
         return np.linspace(0.0, duration, 1 + count)
     hold = float(arguments.positive(hold, "simulate: hold", "the sampling interval in units of time"))
     if steps is not None:
         raise ValueError(f"simulate: got steps = {steps} and hold = {hold}; leave out steps: the output is every hold")
     held = max(1, duration / hold - 1e-9)  # otherwise rounding could add an interval of length zero at the end
-    if held > 10**7:  # 80 MB per state: probably a hold in another unit than the duration
+    if held > MOST_INTERVALS:  # probably a hold in another unit than the duration
         raise ValueError(f"simulate: hold = {hold} makes {held:.3g} intervals of {duration:g}, wanted at most 1e7")
     return np.append(np.arange(math.ceil(held)) * hold, duration)  # the last interval may be shorter

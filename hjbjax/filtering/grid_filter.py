@@ -315,6 +315,8 @@ def signal(on: Discretisation, measured: Measurement, name: str) -> Any:
 
 def _prior(on: Discretisation, given: Callable | Numbers, name: str) -> Any:
     """The initial density, shape (*grid), of integral one."""
+    if callable(given):
+        checks.function_of(given, f"{name}: initial_density", (), x=(on.grid.ndim,))
     density = on.at_nodes(given) if callable(given) else numbers(given, f"{name}: initial_density")
     if np.shape(density) != on.grid.shape:
         raise ValueError(

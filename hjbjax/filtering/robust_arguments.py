@@ -47,6 +47,7 @@ def initial_values(initial: Any, grid: Grid) -> Any:
     """p₀ at the nodes; refused if it is not finite."""
     values: Any
     if callable(initial):
+        checks.function_of(initial, "robust_filter: initial", (), x=(grid.ndim,))
         with own_settings(x64=True):
             x = cast(grid, np.float64).components(np.float64)
             values = components.scalar(initial, x, dtype=np.dtype(np.float64))

@@ -137,6 +137,17 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN else text[: SHOWN - 4] + " ..."
 
 
+def axis_names(given: object, count: int) -> tuple[str, ...]:
+    """One name per axis; x1, x2, ... by default.
+
+    Raises:
+      TypeError: not a sequence of names.
+    """
+    if not isinstance(given, Iterable):
+        raise TypeError(f"Grid.names: got {shown(given)}, wanted one name per axis, as in ('angle', 'rate')")
+    return tuple(str(name) for name in given) or tuple(f"x{axis + 1}" for axis in range(count))
+
+
 def _is_left_out(entries: object) -> bool:
     """True for the defaults of entries per axis: () and None. An array is compared with neither."""
     return entries is None or (isinstance(entries, tuple) and not entries)

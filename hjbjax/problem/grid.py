@@ -75,7 +75,7 @@ class Grid:
         lo, hi = arguments.corner(self.lo, "lo"), arguments.corner(self.hi, "hi")
         shape = arguments.counts(self.shape)
         periodic = arguments.periodic_flags(self.periodic, len(shape))
-        names = tuple(str(name) for name in self.names) or tuple(f"x{axis + 1}" for axis in range(len(shape)))
+        names = arguments.axis_names(self.names, len(shape))
         stretch = arguments.stretchings(self.stretch, len(shape))
         lengths = (len(lo), len(hi), len(shape), len(periodic), len(names), len(stretch))
         if len(set(lengths)) != 1:

@@ -19,7 +19,7 @@ from typing import Any, ParamSpec, TypeVar, dataclass_transform
 import jax
 import numpy as np
 
-from hjbjax.problem.settings import own_settings
+from hjbjax.problem.settings import own_settings, refuse_error_checks
 from hjbjax.problem.types import DType, Numbers
 
 P = ParamSpec("P")
@@ -127,6 +127,7 @@ def front_door(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def entered(*arguments: P.args, **options: P.kwargs) -> T:
+        refuse_error_checks(function.__qualname__.removesuffix(".__init__"))
         with own_settings():
             try:
                 return function(*arguments, **options)
@@ -310,9 +311,12 @@ def numbers(value: object, name: str) -> Any:
     if is_traced(value) and isinstance(value, (jax.core.Tracer, Sequence)):
         return jax.numpy.asarray(value)
     try:
-        if np.asarray(value).dtype.kind in "USc":  # NumPy would parse "1.0" and drop imaginary parts
+        # NumPy would parse "1.0", drop imaginary parts, and count years since 1970
+        if np.asarray(value).dtype.kind in "UScmM":
             raise TypeError
         return np.array(value, dtype=np.float64)  # a copy, so that later changes of the original have no effect
+    except OverflowError:  # an integer beyond 1e308
+        raise ValueError(f"{name}: got {value!r:.60}, wanted numbers that fit into float64") from None
     except (TypeError, ValueError):
         raise TypeError(f"{name}: got {value!r}, wanted numbers") from None
 

@@ -14,6 +14,23 @@ from collections.abc import Iterator
 
 import jax
 
+# error checks write to a global array, which JAX allows neither under ``vmap`` nor in most loops
+ERROR_CHECKS = tuple(f"jax_error_checking_behavior_{name}" for name in ("nan", "divide", "oob"))
+
+
+def refuse_error_checks(caller: str) -> None:
+    """Refuse options of the caller that no context manager can change for the duration of a call.
+
+    Raises:
+      ValueError: one of them is set.
+    """
+    for option in ERROR_CHECKS:
+        if (found := getattr(jax.config, option, "ignore")) != "ignore":
+            raise ValueError(
+                f"{caller}: {option} is {found!r}, wanted 'ignore': JAX cannot put such checks into loops.\n"
+                f"Call jax.config.update({option!r}, 'ignore') first; NaN is found and reported without them."
+            )
+
 
 @contextlib.contextmanager
 def own_settings(*, x64: bool | None = None) -> Iterator[None]:
@@ -40,8 +57,9 @@ def own_settings(*, x64: bool | None = None) -> Iterator[None]:
         jax.default_matmul_precision("highest"),
         # without jit every sweep over a grid would be a loop in Python
         jax.disable_jit(False),
-        # callers forbid new traces of their own programs; every solve traces the functions of its problem
+        # callers forbid traces or runs of their own programs; every solve traces and runs functions of its problem
         jax.no_tracing(False),
+        jax.no_execution(False),
         contextlib.nullcontext() if x64 is None else jax.enable_x64(x64),
     ):
         yield

@@ -325,6 +325,19 @@ def open_checkpoint(
             file.write()
 
 
+def refuse_checkpoint(checkpoint: object, resume: bool, caller: str) -> None:
+    """Refuse a checkpoint inside a JAX transformation, which would leave the run without one.
+
+    Raises:
+      ValueError: there is a checkpoint, or ``resume``.
+    """
+    if checkpoint is not None or resume:
+        raise ValueError(
+            f"{caller}: checkpoint= and resume= work at host level only, not inside jit, vmap and grad: leave them "
+            "out, or call the function outside of the transformation"
+        )
+
+
 @contextlib.contextmanager
 def _named_after(caller: str) -> Iterator[None]:
     """Context in which errors about files are prefixed with the function that was called."""

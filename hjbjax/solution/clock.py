@@ -83,6 +83,12 @@ class Clock:
         """A clock for one of several parallel runs, with its own pace and a common interrupt."""
         return _Beside(self)
 
+    def beside_from_now(self) -> "Clock":
+        """``beside``, with all of the time limit for the run that begins now."""
+        lane = self.beside()
+        lane.began = time.perf_counter()
+        return lane
+
     def over(self) -> Status | None:
         """INTERRUPTED or TIME_LIMIT; ``None`` to continue."""
         # Ctrl-C takes precedence over the time limit
@@ -209,11 +215,13 @@ def noting_interrupts(clock: Clock) -> Iterator[None]:
 
     # a Ctrl-C between two inner runs has set the flag of the outer clock
     clock.interrupted |= any(each.interrupted for each in _running) or bool(_raised)
-    _running.append(clock)
     try:
+        _running.append(clock)
         for number in noted:
             signal.signal(number, note)
         yield
     finally:
+        # first, before Python can raise a second Ctrl-C: all later runs would end with a clock that stays in the list
+        if clock in _running:
+            _running.remove(clock)
         give_back()
-        _running.remove(clock)

@@ -133,6 +133,7 @@ def march(
     _check(problem, grid, scheme, method, step, time_limit)
     if not isinstance(policy, bool):
         raise TypeError(f"march: policy is {policy!r}; wanted True or False")
+    _check_inner(problem, inner)
     checks.check_indices(grid)
     horizon, kept = _times(horizon, times)
     traced = is_traced(problem, grid, method, start)
@@ -140,6 +141,7 @@ def march(
         solved = () if method.limited else (method.evaluation or march_evaluation(problem, grid, divided=True),)
         mesh = checks.over_devices(mesh, "march", problem, grid, scheme, method, *solved, traced=traced)
     if traced:
+        checkpoints.refuse_checkpoint(checkpoint, resume, "march")
         on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))
         return _march_traced(on, horizon, kept, start, method, step, inner, throw)
     kind = arguments.as_dtype(dtype)
@@ -203,6 +205,7 @@ def march_part(
     """``march(..., throw=False)`` on the host for a part of a longer march, without the box error."""
     scheme, method = Limited(split=True) if scheme is None else scheme, Explicit()
     _check(problem, grid, scheme, method, None, time_limit)
+    _check_inner(problem, inner)
     horizon, kept = _times(horizon, None)
     clock = Clock(seconds=time_limit)
     with noting_interrupts(clock), host_loop.announce(clock), own_settings(x64=True):
@@ -379,15 +382,16 @@ def _check_step(step: float | None, limit: float) -> None:
 
 def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
     """The nodes where a disturbance at its bound indicates a blow-up; or None."""
-    problem, grid = on.problem, on.grid
+    return jnp.asarray(on.grid.inner(share)) if share else None
+
+
+def _check_inner(problem: Problem, share: float | None) -> None:
+    """Refuse a fraction of the box to watch that is not a fraction, or has no disturbance to watch."""
     share = 0.0 if share is None else share
     if not arguments.is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"march: inner = {share!r}; wanted the fraction of the box to watch, from 0 (none) to 1")
-    if share == 0:
-        return None
-    if not isinstance(problem.disturbances, Box):
+    if share and not isinstance(problem.disturbances, Box):
         raise ValueError(f"march: inner = {share:g} watches a Box of disturbances; got {problem.disturbances!r}")
-    return jnp.asarray(grid.inner(share))
 
 
 @as_one_program

@@ -150,9 +150,9 @@ def drive(run: Run, clock: Clock) -> Status:
                 chunk = int(np.clip(clock.steps_in(CHUNK_SECONDS, run.nodes), 1, min(run.longest, 8 * done)))
                 if bar is not None:
                     run.show(bar)
-        except KeyboardInterrupt:  # a second Ctrl-C, or a custom handler
+        except KeyboardInterrupt as interrupt:  # a second Ctrl-C, or a custom handler
             clock.interrupted = True
-            status = run.between(Status.INTERRUPTED, clock)
+            status = _status_interrupted(run, clock, interrupt)
         except Exception as error:
             run.keep(error)
             raise
@@ -160,6 +160,18 @@ def drive(run: Run, clock: Clock) -> Status:
             if journal is not None:
                 journal.leave(run, status)
     return status
+
+
+def _status_interrupted(run: Run, clock: Clock, interrupt: KeyboardInterrupt) -> Status:
+    """The status of a run that Ctrl-C stopped at any moment.
+
+    Raises:
+      KeyboardInterrupt: it came between a step, which takes over the memory of the state, and the new state.
+    """
+    try:
+        return run.between(Status.INTERRUPTED, clock)
+    except Exception as error:
+        raise interrupt from error
 
 
 def _suggest_cache(clock: Clock) -> None:
@@ -206,7 +218,12 @@ def progress_bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any
     # tqdm writes nothing to a terminal that does not report its size, such as that of `script` and of some editors
     size = shutil.get_terminal_size()
     shown = {"file": streams.Expendable(sys.stderr), "ncols": size.columns, "nrows": size.lines}
-    with tqdm(**{"delay": 1, "leave": False, **shown, **options}) as bar:
+    try:
+        bar = tqdm(**{"delay": 1, "leave": False, **shown, **options})
+    except Exception:  # tqdm compares the stream with standard error, whose attributes may raise anything
+        yield None
+        return
+    with bar:
         yield bar
 
 

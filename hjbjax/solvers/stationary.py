@@ -121,6 +121,7 @@ def solve(
         known = choose(problem, grid, traced=traced, method=method, divided=True)
         mesh = checks.over_devices(mesh, "solve", problem, grid, *filter(None, [scheme]), known, traced=traced)
     if traced:
+        checkpoints.refuse_checkpoint(checkpoint, resume, "solve")
         if paths is not None:
             raise ValueError(
                 f"solve: {type(scheme).__name__}() runs at host level only; inside jit, vmap and grad use Upwind()"

@@ -34,7 +34,7 @@ from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Nodes, Number
-from hjbjax.solution.clock import Clock, Stopped
+from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, keeping_warnings
 from hjbjax.solvers import host_loop
@@ -187,15 +187,21 @@ def _on_host(asked: Asked, given: Any, on: Discretisation) -> Found:
     like = _shapes(on, may_follow=_may_follow(asked, on.problem, on.grid))
     setting = host_loop.setting("jax_default_device")
 
-    def one(*numbers: np.ndarray) -> Found:
-        mine = list(leaves)
-        for i, number in zip(varying, numbers, strict=True):
-            mine[i] = number
-        with jax.default_device(setting):
-            return _solved(asked, *jax.tree.unflatten(structure, mine))
-
     def all_lanes(*arrays: np.ndarray) -> Found:
-        return _in_lanes(one, arrays, ranks)
+        clock = Clock(asked.max_steps or 10**9, asked.time_limit, progress=False)
+
+        def one(*numbers: np.ndarray) -> Found:
+            mine = list(leaves)
+            for i, number in zip(varying, numbers, strict=True):
+                mine[i] = number
+            with jax.default_device(setting):
+                return _solved(asked, clock.beside_from_now(), *jax.tree.unflatten(structure, mine))
+
+        with noting_interrupts(clock):
+            found = _in_lanes(one, arrays, ranks)
+        if clock.interrupted:  # the caller would otherwise go on with NaN
+            raise KeyboardInterrupt
+        return found
 
     return call_on_host(all_lanes, like, *(leaves[i] for i in varying), vmap_method="expand_dims")
 
@@ -239,10 +245,9 @@ def _in_lanes(one: Callable[..., Found], arrays: tuple[np.ndarray, ...], ranks: 
 
 
 def _solved(
-    asked: Asked, problem: Problem, grid: Grid, method: Method | None, guess: Nodes | None, tol: Number
+    asked: Asked, clock: Clock, problem: Problem, grid: Grid, method: Method | None, guess: Nodes | None, tol: Number
 ) -> Found:
     """The result of one lane, in NumPy; its warnings are dropped, because the user's line is not on the stack."""
-    clock = Clock(asked.max_steps or 10**9, asked.time_limit, progress=False)
     with own_settings(x64=asked.x64), keeping_warnings():
         check_spacings(grid, asked.inner)
         choices = Choices(scheme=asked.scheme is None, method=method is None, levels=method is None)

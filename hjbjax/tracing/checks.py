@@ -19,7 +19,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, remembered
 from hjbjax.problem.settings import own_settings
-from hjbjax.tracing import indices
+from hjbjax.tracing import indices, jaxprs
 from hjbjax.tracing.operations import Operations, operations
 
 OF_ACTION = ("drift", "cost", "noise")
@@ -329,7 +329,7 @@ def _trace_once(
         return () if isinstance(verdicts[0], str) else result
 
     closed = jax.make_jaxpr(probe)(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in lengths))
-    return verdicts[0], indices.first_outside(closed, names), indices.calls_back(closed), operations(closed)
+    return verdicts[0], indices.first_outside(closed, names), jaxprs.calls_back(closed.jaxpr), operations(closed)
 
 
 def _dim(admissible: sets.AdmissibleSet | None) -> int:

@@ -12,7 +12,6 @@ u)))``, which is not a leaf of the problem. Here such numbers become leaves.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import inspect
@@ -30,9 +29,8 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing import jaxprs
+from hjbjax.tracing import host_functions, jaxprs
 from hjbjax.tracing.outside import (
-    ADDRESS,
     FLOATS,
     NUMBERS,
     OfNumbers,
@@ -42,6 +40,7 @@ from hjbjax.tracing.outside import (
     fingerprint,
     identity,
     numbers_read,
+    text_of_called,
     unnested,
 )
 
@@ -84,9 +83,10 @@ def digest(problem: Problem, n: int) -> str:
             account.update(f"{name} {type(function).__name__} ".encode())
             if callable(function):
                 shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in _shapes(problem, name, n)]
-                with contextlib.suppress(Exception):  # a function that cannot be traced is refused by the checks
-                    closed = jax.make_jaxpr(function)(*shapes)
-                    account.update(ADDRESS.sub("", repr(fingerprint(closed.jaxpr, closed.consts)[0])).encode())
+                _, closed = _trace(_bare(function), shapes)
+                if closed is not None:  # a function that cannot be traced is refused by the checks
+                    (numbers, *called), _ = fingerprint(closed.jaxpr, closed.consts)
+                    account.update(repr((numbers, *map(text_of_called, called))).encode())
         account.update(repr((problem.isaacs, type(problem.controls), type(problem.disturbances))).encode())
         for leaf in jax.tree.leaves(problem):
             account.update(np.asarray(leaf, np.float64).tobytes())
@@ -183,7 +183,7 @@ class Marked:
             return self.__wrapped__(*arguments, **options)
         closed, structure = found
         leaves = [_as_traced(leaf) for leaf in jax.tree.leaves((options, arguments))]
-        return jax.tree.unflatten(structure, jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *leaves))
+        return jax.tree.unflatten(structure, host_functions.evaluate(closed.jaxpr, closed.consts, *leaves))
 
     def jaxpr(self, options: dict, arguments: tuple) -> tuple[jex.ClosedJaxpr, Any] | None:
         """The jaxpr of the leaves of (options, arguments) and the tree of its results; None without a jaxpr.
@@ -247,7 +247,7 @@ class Opened:
         constants, leaves = known
         # a jaxpr requires the dtypes of its trace, and a solve may have cast the leaves to float32 meanwhile
         closed = self._in_traced_dtypes(constants, self.jaxpr.constvars)
-        return jax.core.eval_jaxpr(
+        return host_functions.evaluate(
             self.jaxpr, closed, *self._in_traced_dtypes((*leaves, *arguments), self.jaxpr.invars)
         )[0]
 

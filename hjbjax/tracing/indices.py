@@ -67,11 +67,6 @@ def first_outside(closed: jex.ClosedJaxpr, names: Sequence[str] = ()) -> str | N
     return _walk(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars), labels)[1]
 
 
-def calls_back(closed: jex.ClosedJaxpr) -> bool:
-    """True if a jaxpr calls Python while it runs."""
-    return any("callback" in eqn.primitive.name or any(map(calls_back, _inner(eqn))) for eqn in closed.jaxpr.eqns)
-
-
 def _walk(
     jaxpr: jex.Jaxpr, consts: Sequence[Any], inputs: Sequence[Any], labels: Sequence[str | None]
 ) -> tuple[list[np.ndarray | None], str | None]:
@@ -92,7 +87,7 @@ def _walk(
             return [], found
         results: Sequence[Any] = [None] * len(eqn.outvars)
         passed = [None if jaxprs.is_literal(var) else called.get(var) for var in eqn.invars]
-        inner = _inner(eqn)
+        inner = jaxprs.inner(eqn)
         if eqn.primitive.name == "scan":  # its counters are known in each iteration, but not in the body in general
             inner, (results, found) = [], _walk_turns(eqn, known, passed)
             if found is not None:
@@ -142,18 +137,6 @@ def _count_whole(outside: Sequence[jex.Var | jex.Literal], inside: Sequence[jex.
     """
     pairs = zip(outside, inside, strict=True)
     return sum(len(array_type(whole).shape) == len(array_type(part).shape) for whole, part in pairs)
-
-
-def _inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:
-    """The jaxprs that an equation calls, without those that combine two entries of a scatter."""
-    found = []
-    for name, value in eqn.params.items():
-        for each in value if isinstance(value, (tuple, list)) else (value,):
-            if jaxprs.is_closed(each):
-                found.append(each)
-            elif jaxprs.is_open_jaxpr(each) and name != "update_jaxpr":
-                found.append(jaxprs.closed(each))
-    return found
 
 
 def _index_array(value: Numbers) -> np.ndarray | None:

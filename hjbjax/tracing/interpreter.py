@@ -18,7 +18,7 @@ import numpy as np
 
 from hjbjax.problem import streams
 from hjbjax.problem.types import Numbers
-from hjbjax.tracing import jaxprs
+from hjbjax.tracing import host_functions, jaxprs
 from hjbjax.tracing.jaxprs import (
     CALLS,
     CUMULATIVE,
@@ -104,7 +104,7 @@ def evaluate_jaxpr(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebr
 
 def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
     """Results of one equation by the first rule that applies."""
-    name = eqn.primitive.name
+    name = host_functions.NAME if host_functions.is_host_call(eqn) else eqn.primitive.name
     if not any(map(varies, operands)):
         return _bind_uniform(eqn, operands)
     if name in CALLS and CALLS[name] in eqn.params:

@@ -161,3 +161,22 @@ def _in_use(constant: Any) -> Any:
         return constant
     dtype = jax.dtypes.canonicalize_dtype(constant.dtype)
     return constant if constant.dtype == dtype else np.asarray(constant, dtype)
+
+
+def inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:
+    """The jaxprs that an equation calls, without those that combine two entries of a scatter."""
+    found = []
+    for name, value in eqn.params.items():
+        for each in value if isinstance(value, (tuple, list)) else (value,):
+            if is_closed(each):
+                found.append(each)
+            elif is_open_jaxpr(each) and name != "update_jaxpr":
+                found.append(closed(each))
+    return found
+
+
+def calls_back(jaxpr: jex.Jaxpr) -> bool:
+    """True if a jaxpr calls Python while it runs."""
+    return any(
+        "callback" in eqn.primitive.name or any(calls_back(each.jaxpr) for each in inner(eqn)) for eqn in jaxpr.eqns
+    )

@@ -118,7 +118,7 @@ def code(function: Callable) -> object:
     return getattr(getattr(function, "__func__", function), "__code__", function)
 
 
-def fingerprint(jaxpr: jex.Jaxpr, consts: Iterable[Numbers] = ()) -> tuple[Hashable, bool]:
+def fingerprint(jaxpr: jex.Jaxpr, consts: Iterable[Numbers] = ()) -> tuple[tuple[Hashable, ...], bool]:
     """A mark of what a jaxpr computes, including all its numbers, and True if the mark is complete.
 
     A jaxpr does not contain the computations of derivative rules, except for JAX's own.
@@ -250,6 +250,27 @@ def unnested(function: Partial) -> Partial:
 def _is_partial(thing: object) -> TypeGuard[Partial]:
     """True for a function with some of its arguments."""
     return isinstance(thing, Partial)
+
+
+def text_of_called(called: Any) -> str:
+    """A description of a host function in a fingerprint, the same in every process, by its code and what it holds."""
+    function = called[0] if isinstance(called, tuple) else getattr(called, "__func__", called)
+    owner = getattr(called, "__self__", None)
+    held = [content(cell) for cell in getattr(function, "__closure__", None) or ()]
+    found = (
+        _text_of_code(code(function)),
+        held,
+        getattr(function, "__defaults__", None),
+        getattr(owner, "__dict__", None),
+    )
+    return ADDRESS.sub("", repr(found))
+
+
+def _text_of_code(found: object) -> str:
+    """The instructions of a function, with those of the functions that it makes; no line numbers and addresses."""
+    if not isinstance(found, types.CodeType):
+        return repr(found)
+    return repr((found.co_code, found.co_names, [_text_of_code(each) for each in found.co_consts]))
 
 
 class OfNumbers:

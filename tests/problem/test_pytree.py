@@ -187,10 +187,18 @@ def test_cast_changes_floating_leaves_alone():
     assert tree["n"].dtype == np.arange(2).dtype
 
 
-@pytest.mark.parametrize("value", ["1", "a", ["1.0"], 1j, [1j], [[1.0], [1.0, 2.0]], {}, object(), drift])
+@pytest.mark.parametrize(
+    "value", ["1", "a", ["1.0"], 1j, [1j], [[1.0], [1.0, 2.0]], {}, object(), drift, np.datetime64("2020")]
+)
 def test_numbers_refuses_what_is_none(value):
     with pytest.raises(TypeError, match="mass: got .* wanted numbers"):
         numbers(value, "mass")
+
+
+def test_numbers_refuses_an_integer_beyond_floating_point():
+    with pytest.raises(ValueError, match=r"mass: got 10+, wanted numbers that fit into float64") as caught:
+        numbers(10**400, "mass")
+    assert len(str(caught.value)) < 150
 
 
 def test_numbers_takes_any_nesting_of_numbers_and_tracers():

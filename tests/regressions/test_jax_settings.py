@@ -37,6 +37,7 @@ SETTINGS = {
     "bfloat16": {"jax_default_matmul_precision": "bfloat16"},
     "no_jit": {"jax_disable_jit": True},
     "no_tracing": {"jax_no_tracing": True},
+    "no_execution": {"jax_no_execution": True},
     "log": {"jax_log_compiles": True, "jax_explain_cache_misses": True},
 }
 # The package leaves these to the caller. Each has programs of its own, which take long to compile again.
@@ -185,7 +186,10 @@ PLANT_DISCOUNTED = hjb.Problem(drift, cost, U, noise=0.5, discount=1.0)
 WEIGHTS = jnp.array([0.8, 0.9])
 OBSERVERS = ("ExtendedKalman", "Luenberger", "GridFilter", "RobustGridFilter", "WonhamFilter")
 FOLLOWS_JAX = ("jit and grad", "vmap", "grad without jit", "lie_bracket", *OBSERVERS)
-BY_ITSELF = {("grad without jit", "no_transfers")}  # JAX's own ``grad`` makes such a transfer
+BY_ITSELF = {  # JAX's own ``grad`` makes such a transfer, and a program of the caller's own does not run
+    ("grad without jit", "no_transfers"),
+    *((door, "no_execution") for door in ("jit and grad", "grad without jit", "vmap", "queries", "hinf_level")),
+}
 
 
 def turning(x):
@@ -221,6 +225,8 @@ A_QUARTER = [(door, name) for i, door in enumerate(MORE) for j, name in enumerat
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("door", DOORS)
 def test_an_answer_does_not_depend_on_a_setting(door, setting):
+    if (door, setting) in BY_ITSELF:
+        return
     programs = check(door, setting, SETTINGS[setting])
     # the same options hold inside, so that the programs are the same; a device and the caller's ``jit`` have their own
     assert not programs or setting == "device" or door == "jit and grad"
@@ -292,11 +298,25 @@ def test_the_caller_and_other_threads_keep_their_options():
     with caller(theirs):
         hjb.solve(hjb.Problem(drift, cost, U, discount=1.0), GRID, scheme=hjb.Upwind())
         assert options_here() == theirs
-        with jax.no_tracing(False), pytest.raises(jax.errors.JaxRuntimeError, match="Disallowed host-to-device"):
+        with (
+            jax.no_tracing(False),
+            jax.no_execution(False),
+            pytest.raises(jax.errors.JaxRuntimeError, match="Disallowed host-to-device"),
+        ):
             jnp.sin(np.ones(2))
     assert seen["beside"] == theirs
     alike = {name for name, value in theirs.items() if seen["inside"][name] == value}
     assert alike == {"jax_log_compiles", "jax_explain_cache_misses", "jax_disable_jit"}
+
+
+@pytest.mark.parametrize("name", ["nan", "divide", "oob"])
+def test_an_option_that_cannot_be_changed_for_one_call_is_refused(name):
+    option = f"jax_error_checking_behavior_{name}"
+    with caller({option: "raise"}):
+        for door in ("solve", "march", "simulate", "zakai"):
+            with pytest.raises(ValueError, match=f"{door}|GridFilter") as caught:
+                DOORS[door]()
+            assert f"jax.config.update('{option}', 'ignore')" in str(caught.value)
 
 
 def test_the_options_end_with_a_call_that_raises():

@@ -19,6 +19,7 @@ from hjbjax.extremals import collocation, continuation, equilibria
 from hjbjax.feedback import simulation
 from hjbjax.markov_chain import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.solution import clock as clock_module
 from hjbjax.solution.clock import Clock, Stopped, interruptible, noting_interrupts
 from hjbjax.solvers import batch, host_loop, march_run, stationary_run
 from hjbjax.solvers.march_run import MarchRun
@@ -157,6 +158,37 @@ def test_runs_inside_runs_share_their_note_and_only_the_outermost_gives_the_hand
     after = Clock()
     with noting_interrupts(after):
         assert not after.interrupted
+
+
+class Pressed(list):
+    """A list of clocks during whose changes Ctrl-C is pressed, as it may be between any two instructions."""
+
+    def append(self, clock):
+        super().append(clock)
+        raise KeyboardInterrupt
+
+
+def test_ctrl_c_at_the_begin_and_the_end_of_a_run_leaves_no_clock(monkeypatch):
+    """A clock that stays interrupts all later runs, or leaves Ctrl-C to Python."""
+    pressed = Pressed()
+    monkeypatch.setattr(clock_module, "_running", pressed)
+    with pytest.raises(KeyboardInterrupt), noting_interrupts(Clock()):
+        pass
+    assert pressed == []
+    running = []
+    monkeypatch.setattr(clock_module, "_running", running)
+    give_back = signal.signal
+
+    def press(number, handler):
+        give_back(number, handler)
+        if handler is signal.default_int_handler:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), noting_interrupts(Clock()):
+        monkeypatch.setattr(signal, "signal", press)
+    monkeypatch.undo()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    assert running == []
 
 
 def test_a_handler_of_the_users_own_stays():

@@ -242,11 +242,48 @@ def test_functions_of_another_shape_are_refused_where_nothing_else_would_tell():
             lambda: hjb.Grid([0.0], [1.0], (3,), stretch=hjb.Sinh(3.0)),
             r"wanted one entry per axis, as in \(hjb.Sinh\(3.0\)",
         ),
+        (lambda: hjb.Grid([0.0], [1.0], (3,), names=None), "Grid.names: got None, wanted one name per axis"),
+        (
+            lambda: hjb.hinf_level(lambda gamma: problem(), U, 0.1, 8.0),
+            "hinf_level: got Box for the grid, wanted a Grid",
+        ),
+        (lambda: hjb.reach(written, U, None), "reach: target: got None, wanted a function of one state"),
+        (lambda: hjb.avoid(written, U, None), "avoid: obstacle: got None, wanted a function of one state"),
+        (lambda: hjb.reach_avoid(written, U, still, None), "reach_avoid: obstacle: got None, wanted a function"),
     ],
 )
 def test_arguments_that_changed_places_are_told(ask, said):
     with pytest.raises(TypeError, match=said):
         ask()
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda: hjb.simulate(problem(), still, [0.5], 1.0, steps=10**13), "simulate: steps = 10+, wanted at most 1e7"),
+        (lambda: hjb.simulate(problem(), still, [0.5], 1.0, hold=1e-13), "wanted at most 1e7"),
+        (lambda: robust(lambda x: x), r"robust_filter: initial\(x\) returned shape \(1,\), expected one number"),
+        (lambda: zakai(lambda x: x), r"GridFilter: initial_density\(x\) returned shape \(1,\), expected one number"),
+    ],
+)
+def test_what_numpy_and_jax_would_say_is_said_in_the_words_of_the_user(ask, said):
+    with pytest.raises(ValueError, match=said):
+        ask()
+
+
+def robust(initial):
+    plant = hjb.Problem(lambda x, u: u - x, lambda x, u: x @ x, U, noise=0.5)
+    return hjb.filtering.robust_filter(plant, still, GRID, np.zeros((2, 1)), 0.1, initial, gamma=2.0)
+
+
+def zakai(density):
+    plant = hjb.Problem(lambda x, u: -x, None, None, noise=0.5)
+    return hjb.filtering.zakai(plant, still, GRID, np.zeros((2, 1)), 0.1, density)
+
+
+def test_a_march_refuses_its_arguments_before_it_looks_at_the_problem():
+    with pytest.raises(ValueError, match="march: inner = -1; wanted the fraction"):
+        hjb.march(problem(lambda x, u: jnp.zeros(3)), GRID, 1.0, inner=-1)
 
 
 def test_a_batch_names_the_lane_of_a_refusal():

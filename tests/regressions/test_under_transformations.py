@@ -1,6 +1,7 @@
 """``solve`` under jit, vmap and grad beside ``solve`` and ``solve_batch``: one path, and so one answer."""
 
 import inspect
+import signal
 import warnings
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.solvers import transformed
+from hjbjax.solvers.stationary_run import StationaryRun
 
 # name, nodes of each axis, or None for those of the problem
 QUICK = [("pendulum", (30, 31)), ("double-integrator", (21, 21)), ("bang-bang", (41,))]
@@ -94,6 +96,41 @@ def test_an_interrupt_on_the_host_is_one_for_the_caller(by, monkeypatch):
     monkeypatch.setattr(transformed, "_solved", pressed)
     with pytest.raises(KeyboardInterrupt):
         jax.grad(value)(0.5) if by == "grad" else jax.vmap(value)(jnp.ones(2))
+
+
+@pytest.mark.parametrize("door", ["solve", "march"])
+@pytest.mark.parametrize("option", [{"checkpoint": "run.npz"}, {"resume": True}])
+def test_a_checkpoint_inside_a_transformation_is_refused(door, option):
+    """It was ignored, and a run of hours had no file."""
+    line = hjb.Grid([-1.0], [1.0], (9,))
+
+    def value(weight):
+        problem = hjb.Problem(lambda x, u: weight * u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+        found = hjb.solve(problem, line, **option) if door == "solve" else hjb.march(problem, line, 1.0, **option)
+        return found.value.sum()
+
+    with pytest.raises(ValueError, match=f"^{door}: checkpoint= and resume= work at host level only"):
+        jax.grad(value)(1.0)
+
+
+def test_ctrl_c_in_the_steps_of_one_lane_ends_all_lanes_and_is_not_an_answer(monkeypatch):
+    """The caller's loop would go on with NaN, after the other lanes have run to their ends."""
+    line = hjb.Grid([-1.0], [1.0], (9,))
+    pressed = []
+
+    def advance(run, count):
+        if not pressed:
+            pressed.append(signal.raise_signal(signal.SIGINT))
+        return usual(run, count)
+
+    def value(weight):
+        problem = hjb.Problem(lambda x, u: weight * u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+        return hjb.solve(problem, line, method=hjb.ValueIteration(), scheme=hjb.Upwind(), tol=1e-9).value[0]
+
+    usual = StationaryRun.advance
+    monkeypatch.setattr(StationaryRun, "advance", advance)
+    with pytest.raises(KeyboardInterrupt):
+        jax.vmap(value)(np.array([0.5, 1.0, 2.0]))
 
 
 @pytest.mark.slow

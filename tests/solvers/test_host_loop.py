@@ -237,6 +237,18 @@ def test_ctrl_c_keeps_the_partial_solution(pressed):
     assert solution.residuals.shape == (solution.steps + 1,)
 
 
+def test_ctrl_c_that_loses_a_step_is_no_other_error(monkeypatch):
+    """A second one, between a program that has taken over the memory of the state, and the new state."""
+
+    def advance(run, count):
+        jax.block_until_ready(run._run(run.task, run.state, 1))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stationary_run.StationaryRun, "advance", advance)
+    with pytest.raises(KeyboardInterrupt):
+        hjb.solve(**endless())
+
+
 @pytest.mark.usefixtures("pressed")
 def test_ctrl_c_says_how_to_go_on():
     with pytest.raises(hjb.SolveError, match=r"INTERRUPTED.*guess=") as caught:

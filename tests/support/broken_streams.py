@@ -39,6 +39,13 @@ class Deaf(Mute):
         raise RuntimeError("wrapped C++ object of type QPlainTextEdit has been deleted")
 
 
+class Proxy(Mute):
+    """A stand-in that raises its own error for every attribute that it lacks."""
+
+    def __getattr__(self, name):
+        raise RuntimeError(f"the console has no {name}")
+
+
 def closed():
     stream = io.TextIOWrapper(io.BytesIO())
     stream.close()
@@ -58,6 +65,7 @@ BROKEN = {
     "only write": Mute,
     "nothing": object,
     "deleted": Deaf,
+    "proxy": Proxy,
     "no reader": lambda: Failing(BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))),
     "full": lambda: Failing(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))),
     "closed terminal": lambda: Failing(ValueError("I/O operation on closed file")),

@@ -580,6 +580,34 @@ def test_functions_of_the_host_are_told_apart():
         np.testing.assert_allclose(solved(car.drift), solved(lambda x, u, gain=car.gain: gain * u), atol=1e-3)
 
 
+HOST = """
+def host(x):
+    return GAIN * x
+
+
+def drift(x, u):
+    return jax.pure_callback(host, jax.ShapeDtypeStruct(x.shape, x.dtype), x, vmap_method="expand_dims") + u
+"""
+
+
+def test_a_digest_of_a_function_of_the_host_is_that_of_every_process():
+    """A checkpoint is resumed by another process, where code and globals are at other addresses."""
+
+    def digest(gain):
+        module = {"jax": jax}
+        exec(HOST.replace("GAIN", gain), module)
+        problem = hjb.Problem(module["drift"], square, UNIT, discount=1.0)
+        return closures.digest(closures.settled(problem, 1), 1)
+
+    assert digest("2.0") == digest("2.0")
+    assert digest("2.0") != digest("3.0")
+    made = []
+    for gain in (0.0, 1.0, 1.0):
+        problem = hjb.Problem(OnHost(gain).drift, square, UNIT, discount=1.0)
+        made.append(closures.digest(closures.settled(problem, 1), 1))
+    assert made[0] != made[1] == made[2]
+
+
 @pytest.mark.slow
 def test_rules_of_derivatives_that_a_jaxpr_does_not_tell():
     def ruled(slope):

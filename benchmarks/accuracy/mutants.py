@@ -124,8 +124,8 @@ MUTANTS = (
     Mutant(
         "target mask",
         "iteration/bellman.py",
-        "else cut_cells.level(on) <= 0",
-        "else cut_cells.level(on) < 0",
+        "else on.level <= 0",
+        "else on.level < 0",
         ("tests/regressions/test_boundary_nodes.py",),
     ),
     Mutant(
@@ -159,8 +159,8 @@ MUTANTS = (
     Mutant(
         "half an error bound",
         "iteration/certificates.py",
-        "return grid.least(policy.defect) / discount, grid.largest(policy.defect) / discount",
-        "return grid.least(policy.defect) / (2 * discount), grid.largest(policy.defect) / (2 * discount)",
+        "return layout.least(policy.defect) / discount, layout.largest(policy.defect) / discount",
+        "return layout.least(policy.defect) / (2 * discount), layout.largest(policy.defect) / (2 * discount)",
         ("tests/iteration/test_certificates.py",),
     ),
 )

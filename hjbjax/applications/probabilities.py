@@ -224,7 +224,7 @@ def expected_exit_time(
 def _refuse_open(grid: object, name: str) -> None:
     """Raise if a grid has open ends; ``solve`` refuses other objects."""
     if isinstance(grid, Grid):
-        grid.refuse_prescribed(name, "which prescribe V and not a probability or a time")
+        checks.refuse_prescribed(grid, name, "which prescribe V and not a probability or a time")
     if isinstance(grid, Grid) and grid.sides("open"):
         raise ValueError(
             f"{name}: an open end extrapolates the value from inside, so it is not a probability or a time;\n"

@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import cut_cells
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.paths import Plan
 from hjbjax.problem.grid import Grid
@@ -98,7 +97,7 @@ def trace(on: Discretisation, plan: Plan, held: Mask, *, running: bool) -> Arcs:
     """
     slowest = SLOWEST * _fastest(on, plan)
     start = [jnp.broadcast_to(x, on.grid.shape) for x in on.coordinates()]
-    level = None if on.problem.target is None else cut_cells.level(on)
+    level = None if on.problem.target is None else on.level
     further = jnp.diff(jnp.asarray(plan.legs), prepend=0)
 
     def under(action: jax.Array) -> Arcs:
@@ -133,7 +132,7 @@ def trace_chosen(on: Discretisation, plan: Plan, number: AtNodes, held: Mask) ->
         return jax.tree.map(lambda new, old: jnp.where(done < legs, new, old), moved, path), None
 
     start = [jnp.broadcast_to(x, on.grid.shape) for x in on.coordinates()]
-    level = None if on.problem.target is None else cut_cells.level(on)
+    level = None if on.problem.target is None else on.level
     zero = jnp.zeros(on.grid.shape, on.dtype)
     path = ArcPath(start, zero, zero, level, jnp.asarray(held))
     path = jax.lax.scan(further, path, jnp.arange(int(np.max(plan.legs))))[0]

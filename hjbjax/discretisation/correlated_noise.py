@@ -12,17 +12,17 @@ most one. If it is less, ρ = (I − M)⁻¹ s for some s > 0; if it is one, ρ 
 
 import dataclasses
 import functools
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.settings import own_settings
-from hjbjax.tracing import checks
 
 Actions: TypeAlias = tuple[np.ndarray, np.ndarray]
 
@@ -111,7 +111,7 @@ def advice(on: Discretisation, a: ArrayLike, actions: Actions) -> str:
         "Every axis i needs a_ii/h_i ≥ Σ_j |a_ij|/h_j (a = σσᵀ); here diag a = "
         f"{_numbers(np.diag(a))}, h = {_numbers(h)}.\n"
     )
-    on = dataclasses.replace(on, dtype=np.dtype(np.float64), cut=None)
+    on = dataclasses.replace(on, dtype=np.dtype(np.float64))
     with own_settings(x64=True):
         return head + _remedy(on, a, actions, h)
 
@@ -210,24 +210,10 @@ def _numbers(entries: ArrayLike) -> str:
     return "[" + ", ".join(f"{entry:.6g}" for entry in np.asarray(entries, dtype=float)) + "]"
 
 
-def along_axis(a: dict[tuple[int, int], jax.Array], grid: Grid, axis: int) -> Any:
-    """a_ii − Σ_j |a_ij| h_i/h_j: the noise left for jumps along axis i after the diagonal jumps; None without any."""
-    left = a.get((axis, axis))
-    if left is None:
-        return None
-    for (i, j), entry in a.items():
-        if i != j:
-            checks.refuse_stretched(grid)  # between unequal cells there are no diagonals
-        if i != j and axis in (i, j):
-            other = j if axis == i else i
-            left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))
-    return left
-
-
 def lacking(on: Discretisation, a: dict[tuple[int, int], jax.Array]) -> jax.Array | None:
     """The nodes at which the diagonal jumps take more noise than an axis has, bool; None without correlation."""
     if all(i == j for i, j in a):
         return None
     slack = 16 * on.grid.ndim * jnp.finfo(on.dtype).eps  # rounding in σσᵀ and in the spacings
-    short = (along_axis(a, on.grid, i) < -slack * jnp.asarray(a[i, i], on.dtype) for i in range(on.grid.ndim))
+    short = (stencil.noise_along(a, on.grid, i) < -slack * jnp.asarray(a[i, i], on.dtype) for i in range(on.grid.ndim))
     return functools.reduce(jnp.logical_or, short)

@@ -7,51 +7,49 @@ linear there. The link is cut to θh and ends on the boundary, where the exit co
 which jumps to the boundary at rates for the distance θh.
 """
 
-import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation import stencil
-from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.stencil import Links, PerNode
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Field
-from hjbjax.tracing import components
 
-KEPT = 200_000  # largest grid whose cut links are stored: 34 bytes per node and axis, but half the compile time
 SHORTEST = 1e-2  # in units of the spacing: a shorter link would only make the rates large
 ROUNDINGS = 16  # units of eps of the largest coordinate: 6 for a stretched axis, and a few operations for l
 
 
-def level(on: Discretisation) -> Field:
-    """l at every node, shape (*grid), with an exact zero where it is zero up to rounding; ≤ 0 in the target.
+def level(values: Field, grid: Grid) -> Field:
+    """The values of l with an exact zero where l is zero up to rounding, (*grid).
 
     The rounding error of l is estimated from its slopes, so neither units nor distant values matter. The smaller of the
     two one-sided slopes is used, since the other may cross a jump.
     """
-    found, grid, slack = on.at_nodes(on.problem.target), on.grid, jnp.zeros((), on.dtype)
+    eps, slack = jnp.finfo(values.dtype).eps, jnp.zeros((), values.dtype)
     for axis in range(grid.ndim):
-        up, down = stencil.one_sided(found, grid, axis)
+        up, down = stencil.one_sided(values, grid, axis)
         # coordinates are computed from lo and hi, so their error is relative to the larger, even near zero
         farthest = jnp.maximum(jnp.abs(grid.lo[axis]), jnp.abs(grid.hi[axis]))
         up, down = jnp.abs(up), jnp.abs(down)
         end = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)  # one slope is missing there
         slope = jnp.where(end, jnp.maximum(up, down), jnp.minimum(up, down))
         # shifts along all axes at once: in the worst case their effects add up
-        slack = slack + ROUNDINGS * jnp.finfo(on.dtype).eps * farthest * slope
-    return jnp.where(jnp.abs(found) <= slack, 0, found)
+        slack = slack + ROUNDINGS * eps * farthest * slope
+    return jnp.where(jnp.abs(values) <= slack, 0, values)
 
 
-def links(on: Discretisation) -> list[Links]:
-    """The links along every axis, cut at the boundary of the target if the scheme has ``subcell``."""
-    problem, grid = on.problem, on.grid
-    plain = [stencil.grid_links(grid, axis) for axis in range(grid.ndim)]
-    if not on.scheme.subcell or problem.target is None:
-        return plain
-    if on.cut is not None:
-        return list(on.cut)
-    x, here = on.coordinates(), level(on)
+def links(x: Sequence[Any], here: Field, exit_cost: Callable[[list], Any], grid: Grid) -> tuple[Links, ...]:
+    """The links along every axis, cut at the boundary of the target.
+
+    Args:
+      x: the coordinates of the nodes.
+      here: l at the nodes, see ``level``.
+      exit_cost: maps the coordinates of states to the exit cost there.
+      grid: the grid.
+    """
 
     def cut(axis: int, step: int, length: PerNode) -> tuple[Field, tuple[Field, Field]]:
         """The length of every link in one direction, and where it meets the target with the exit cost there."""
@@ -62,27 +60,17 @@ def links(on: Discretisation) -> list[Links]:
         theta = jnp.where(meets, jnp.maximum(here / jnp.where(meets, here - beyond, 1), SHORTEST), 1)
         # the exit cost is evaluated at the crossing, not at a node
         crossing = _across_seam(x[axis] + step * theta * length, grid, axis)
-        boundary = [crossing if i == axis else entry for i, entry in enumerate(x)]
-        paid = components.of_state(problem, problem.exit_cost, boundary, on.t, on.dtype)
+        paid = exit_cost([crossing if i == axis else entry for i, entry in enumerate(x)])
         return theta * length, (meets, jnp.broadcast_to(paid, grid.shape))
 
     result = []
-    for axis, link in enumerate(plain):
+    for axis in range(grid.ndim):
+        link = stencil.grid_links(grid, axis)
         (up, meets_up), (down, meets_down) = cut(axis, 1, link.up), cut(axis, -1, link.down)
         # beyond a wall is the mirror image of the cut link
         mirrored = jnp.where(stencil.wall(grid, axis, 1), down, up), jnp.where(stencil.wall(grid, axis, -1), up, down)
         result.append(Links(*mirrored, meets_up, meets_down))
-    return result
-
-
-def keeps(on: Discretisation) -> bool:
-    """True if the cut links are stored: they exist and the grid is small enough."""
-    return on.scheme.subcell and on.problem.target is not None and on.grid.size <= KEPT
-
-
-def kept(on: Discretisation) -> Discretisation:
-    """The discretisation with stored cut links, if the grid is small enough."""
-    return dataclasses.replace(on, cut=tuple(links(on))) if keeps(on) else on
+    return tuple(result)
 
 
 def _across_seam(coordinate: jax.Array, grid: Grid, axis: int) -> jax.Array:

@@ -8,24 +8,21 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
-from hjbjax.discretisation import stencil
+from hjbjax.discretisation import cut_cells, stencil
 from hjbjax.discretisation.paths import Paths
+from hjbjax.discretisation.players import Players, find_players
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Parts
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.tracing import components, dependence
-
-T = TypeVar("T", bound=Any)
 
 
 class Scheme(abc.ABC):
@@ -137,7 +134,7 @@ class Chain(Scheme):
         """
 
 
-@pytree_dataclass(static=("scheme", "dtype", "mesh"))
+@pytree_dataclass(static=("scheme", "dtype"))
 class Discretisation:
     """A problem on a grid, discretised by a scheme, in one floating-point type and at one time.
 
@@ -150,8 +147,6 @@ class Discretisation:
       scheme: the scheme for the derivatives.
       dtype: the floating-point type of all node values.
       t: the time, used if the problem depends on it.
-      cut: the links that end on the boundary of a target, stored by ``cut_cells.kept``; None: computed on use.
-      mesh: the devices over which the nodes are divided during the iteration; None: one device.
     """
 
     problem: Problem
@@ -159,8 +154,7 @@ class Discretisation:
     scheme: Scheme
     dtype: Any
     t: Any = 0.0
-    cut: tuple[Links, ...] | None = None
-    mesh: Mesh | None = None
+    _links: tuple[Links, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``with_links``
 
     def __post_init__(self) -> None:
         # jnp.float32 and "float32" hash differently from np.dtype, so each would compile its own program
@@ -169,31 +163,58 @@ class Discretisation:
     @property
     def chain(self) -> "Discretisation":
         """The discretisation by the scheme's monotone chain."""
-        return dataclasses.replace(self, scheme=self.scheme.chain)
+        return self.with_scheme(self.scheme.chain)
+
+    def with_scheme(self, scheme: Scheme) -> "Discretisation":
+        """The discretisation by another scheme."""
+        same = scheme.subcell == self.scheme.subcell
+        return altered(self, scheme=scheme) if same else dataclasses.replace(self, scheme=scheme)
 
     def at(self, t: Any) -> "Discretisation":
         """The discretisation at another time."""
-        return dataclasses.replace(self, t=t, cut=None)
+        return dataclasses.replace(self, t=t)
 
     def asking(self, problem: Problem) -> "Discretisation":
         """The discretisation of another problem."""
         same = problem.target is self.problem.target and problem.exit_cost is self.problem.exit_cost
-        return dataclasses.replace(self, problem=problem, cut=self.cut if same else None)
+        return altered(self, problem=problem) if same else dataclasses.replace(self, problem=problem)
 
     def on_grid(self, grid: Grid) -> "Discretisation":
         """The discretisation on another grid."""
-        return dataclasses.replace(self, grid=grid, cut=None)
+        return dataclasses.replace(self, grid=grid)
+
+    @functools.cached_property
+    def players(self) -> Players:
+        """The players; if their drifts are upwinded separately, they are decoupled on the grid."""
+        found = find_players(self.problem, self.grid.ndim, self.dtype)
+        return dataclasses.replace(found, decoupled=found.decoupled or self.apart)
 
     @property
-    def settled(self) -> "Discretisation":
-        """The discretisation for a program in which the grid is constant, see ``Grid.settled``."""
-        return altered(self, grid=self.grid.settled())
+    def level(self) -> jax.Array:
+        """l at every node, (*grid), with an exact zero where it is zero up to rounding; ≤ 0 in the target."""
+        return cut_cells.level(self.at_nodes(self.problem.target), self.grid)
 
     @property
-    def parts(self) -> Parts | None:
-        """The parts of the grid over the mesh; None for one device, and for grids too small to divide."""
-        parts = None if self.mesh is None else Parts(self.mesh, self.grid.shape)
-        return parts if parts is not None and parts.fits else None
+    def cuts_links(self) -> bool:
+        """True if links may end on the boundary of a target between two nodes."""
+        return self.scheme.subcell and self.problem.target is not None
+
+    @property
+    def links(self) -> tuple[Links, ...]:
+        """The links along every axis, cut at the boundary of the target if the scheme has ``subcell``."""
+        if not self.cuts_links:
+            return tuple(stencil.grid_links(self.grid, axis) for axis in range(self.grid.ndim))
+        if self._links is not None:
+            return self._links
+
+        def exit_cost(x: list) -> jax.Array:
+            return components.of_state(self.problem, self.problem.exit_cost, x, self.t, self.dtype)
+
+        return cut_cells.links(self.coordinates(), self.level, exit_cost, self.grid)
+
+    def with_links(self) -> "Discretisation":
+        """The discretisation with its links stored instead of computed on every use."""
+        return altered(self, _links=self.links)
 
     def coordinates(self) -> list:
         """The n coordinates of all nodes, each of a shape that broadcasts to (*grid)."""
@@ -271,8 +292,7 @@ class Discretisation:
         found: list[dict[int, jax.Array]] = [{} for _ in range(self.grid.ndim)]
         if self.problem.noise is None:
             return found
-        pairs = list(itertools.product(sets.probes(self.problem.controls, self.dtype),
-                                       sets.probes(self.problem.disturbances, self.dtype)))  # fmt: skip
+        pairs = self._probes()
         for axis, step in itertools.product(range(self.grid.ndim), (-1, 1)):
             if self.grid.periodic[axis] or not stencil.has_wall(self.grid, axis, step):
                 continue
@@ -280,6 +300,22 @@ class Discretisation:
             noise = [self.diffusion(u, d, ends).get((axis, axis), jnp.zeros((), self.dtype)) for u, d in pairs]
             found[axis][step] = functools.reduce(jnp.logical_or, [a > 0 for a in noise])
         return found
+
+    def central_nodes(self, x: list, links: Sequence[Links]) -> list[Any]:
+        """For every axis the nodes where central differences are monotone under all representative actions, bool."""
+        # whether H is central must not depend on the action, otherwise its kinks would move with it
+        found: list[Any] = [True] * self.grid.ndim
+        for u, d in self._probes():
+            f, a = self.drift(u, d, x), self.diffusion(u, d, x)
+            for axis, link in enumerate(links):
+                left = stencil.noise_along(a, self.grid, axis)
+                found[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
+        return found
+
+    def _probes(self) -> list[tuple[list, list]]:
+        """Representative pairs of actions of both players."""
+        mine, theirs = (sets.probes(each, self.dtype) for each in (self.problem.controls, self.problem.disturbances))
+        return list(itertools.product(mine, theirs))
 
     def at_nodes(self, ingredient: Any) -> jax.Array:
         """A function of the state, or a number, at every node, shape (*grid); zero for None."""
@@ -290,26 +326,9 @@ class Discretisation:
         return self.problem.arguments(self.coordinates() if x is None else x, u, d, self.t)
 
 
-def over_nodes(task: T, shape: tuple[int, ...]) -> T:
-    """Mark the leaves of a task, or of a march, that have a value at every node, that is, have this ``shape``."""
-
-    def mark(leaf: Any) -> bool:
-        return np.shape(leaf) == shape
-
-    on = task.on
-    # except the leaves of the problem and the grid, which may have this shape by chance
-    nothing, cut = jax.tree.map(lambda _: False, on), jax.tree.map(mark, on.cut)
-    return altered(jax.tree.map(mark, altered(task, on=None)), on=altered(nothing, cut=cut))
-
-
-def on_part(task: T, parts: Parts) -> T:
-    """A task, or a march, on the part of one device, inside ``shard_map``."""
-    return altered(task, on=altered(task.on, grid=task.on.grid.divided(parts)))
-
-
 @dataclasses.dataclass(frozen=True)
 class Differences:
-    """Input of ``Scheme.slopes``: V at the nodes and its differences between nodes.
+    """Input of ``Scheme.slopes``: V at the nodes, its differences between nodes, and where noise acts.
 
     Attributes:
       on: the problem on its grid.
@@ -317,7 +336,7 @@ class Differences:
       value: V, (*grid).
       links: the distances to the neighbours along every axis.
       one_sided: D⁺ and D⁻ along every axis, each (*grid); zero across a wall.
-      lost: the unreachable nodes, whose stored value is far above all others, bool (*grid); None if there are none.
+      unreachable: the nodes whose stored value is far above all others, bool (*grid); None if there are none.
       first_order: true where the slopes are the one-sided differences, a truth value that may be traced; None: nowhere.
         Only schemes with ``blends`` read it, which saves an array per slope.
     """
@@ -327,5 +346,20 @@ class Differences:
     value: jax.Array
     links: tuple[Links, ...]
     one_sided: tuple[tuple[jax.Array, jax.Array], ...]
-    lost: jax.Array | None = None
+    unreachable: jax.Array | None = None
     first_order: jax.Array | None = None
+
+    @property
+    def grid(self) -> Grid:
+        """The grid, for ``stencil`` and ``slopes``."""
+        return self.on.grid
+
+    @functools.cached_property
+    def reflecting(self) -> list[dict[int, jax.Array]]:
+        """The nodes where noise reflects, see ``Discretisation.noisy_walls``."""
+        return self.on.noisy_walls(self.x)
+
+    @functools.cached_property
+    def central(self) -> list[Any] | None:
+        """For every axis the nodes where central differences are monotone for all actions; None without noise."""
+        return None if self.on.problem.noise is None else self.on.central_nodes(self.x, self.links)

@@ -25,8 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise, schemes, stencil
-from hjbjax.discretisation.cut_cells import links
+from hjbjax.discretisation import schemes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
@@ -97,8 +96,8 @@ def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[O
     """The rate of every jump for drift f and diffusion a."""
     grid = on.grid
     table: dict[Offset, Any] = {}
-    for axis, link in enumerate(links(on.chain)):
-        left = correlated_noise.along_axis(a, grid, axis)
+    for axis, link in enumerate(on.chain.links):
+        left = stencil.noise_along(a, grid, axis)
         upward, downward = schemes.weights(on.scheme.chain, f[axis], left, link, grid, axis)
         for step, weight, length in ((1, upward, link.up), (-1, downward, link.down)):
             beyond = stencil.wall(grid, axis, step)
@@ -148,13 +147,13 @@ def largest_rate(on: Discretisation) -> jax.Array:
         itertools.product(*(sets.probes(each, on.dtype) for each in (on.problem.controls, on.problem.disturbances)))
     )
     if on.apart or len(pairs) == 1:
-        return on.grid.largest(fastest_rate(on))
+        return on.grid.layout.largest(fastest_rate(on))
     us, ds = ([jnp.stack(list(entries)) for entries in zip(*each, strict=True)] for each in zip(*pairs, strict=True))
 
     def larger(k: Any, largest: jax.Array) -> jax.Array:
         # one action at a time: for all at once XLA keeps common terms, 17 arrays for a quadrotor in six dimensions
         u, d = ([entry[k] for entry in entries] for entries in (us, ds))
-        return jnp.maximum(largest, on.grid.largest(jump_rates(on, u, d).total()))
+        return jnp.maximum(largest, on.grid.layout.largest(jump_rates(on, u, d).total()))
 
     return jax.lax.fori_loop(0, len(pairs), larger, jnp.zeros((), on.dtype))
 

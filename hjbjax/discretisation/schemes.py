@@ -17,7 +17,7 @@ zero. A second-order scheme with minmod-limited slopes, for equal spacings:
     ...         def least(a, b):
     ...             return jnp.where(a * b > 0, jnp.where(jnp.abs(a) < jnp.abs(b), a, b), 0)
     ...
-    ...         grid, found = around.on.grid, []
+    ...         grid, found = around.grid, []
     ...         for axis, (up, down) in enumerate(around.one_sided):
     ...             bend = up - down
     ...             above, below = (stencil.neighbour(bend, grid, stencil.unit(grid, axis, s)) for s in (1, -1))
@@ -70,17 +70,16 @@ for n < 0 and zero for n > 0, where the drift is cut off.
 """
 
 import functools
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise, slopes, stencil
-from hjbjax.discretisation.discretisation import Chain, Differences, Discretisation, Scheme
+from hjbjax.discretisation import slopes, stencil
+from hjbjax.discretisation.discretisation import Chain, Differences, Scheme
 from hjbjax.discretisation.stencil import Links
-from hjbjax.problem import arguments, sets
+from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 
@@ -239,8 +238,8 @@ class Limited(Scheme):
 
     def slopes(self, around: Differences) -> Slopes:
         """Limited slopes; central ones where these are monotone, a_ii ≥ h |f_i| for all actions."""
-        grid, pairs = around.on.grid, list(zip(around.one_sided, around.links, strict=True))
-        noisy, first = around.on.noisy_walls(around.x), around.first_order
+        grid, pairs = around.grid, list(zip(around.one_sided, around.links, strict=True))
+        noisy, first = around.reflecting, around.first_order
 
         def mean(*bends: jax.Array) -> jax.Array:
             return stencil.van_albada(*bends) if first is None else jnp.where(first, 0, stencil.van_albada(*bends))
@@ -257,33 +256,18 @@ class Limited(Scheme):
                 sharp = stencil.limited(*pair, grid, axis, link, noisy[axis])
                 sharp = sharp if first is None else jax.tree.map(functools.partial(jnp.where, first), pair, sharp)
             found.append(sharp)
-        if around.on.problem.noise is None:
-            return found
-        for axis, quiet in enumerate(calm(around.on, around.x, around.links)):
+        for axis, central in enumerate(around.central or ()):
             (up, down), link = pairs[axis]
             middle = (link.down * up + link.up * down) / (link.up + link.down)
             # at a wall the inner difference, as in ``weights``; the other one is zero
             middle = jnp.where(stencil.walls(grid, axis), up + down, middle)
-            found[axis] = (jnp.where(quiet, middle, found[axis][0]), jnp.where(quiet, middle, found[axis][1]))
+            found[axis] = (jnp.where(central, middle, found[axis][0]), jnp.where(central, middle, found[axis][1]))
         return found
 
 
 def _is_plain(grid: Grid, axis: int) -> bool:
     """True if an axis has equal spacings and at least three nodes, and is not divided among devices."""
-    return grid.stretch[axis] is None and grid.shape[axis] > 2 and not grid.is_divided(axis)
-
-
-def calm(on: Discretisation, x: list, links: Sequence[Links]) -> list:
-    """The nodes where central differences are monotone under all representative actions, for every axis."""
-    problem = on.problem
-    # whether H is central must not depend on the action, otherwise its kinks would move with it
-    found: list = [True] * on.grid.ndim
-    for u, d in itertools.product(sets.probes(problem.controls, on.dtype), sets.probes(problem.disturbances, on.dtype)):
-        f, a = on.drift(u, d, x), on.diffusion(u, d, x)
-        for axis, link in enumerate(links):
-            left = correlated_noise.along_axis(a, on.grid, axis)
-            found[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
-    return found
+    return grid.stretch[axis] is None and grid.shape[axis] > 2 and not grid.layout.is_divided(axis)
 
 
 @pytree_dataclass()
@@ -304,7 +288,7 @@ class Eno2(Scheme):
 
     def slopes(self, around: Differences) -> Slopes:
         """The slopes of the smoother of two stencils."""
-        return slopes.eno2(around.value, around.on.grid, around.on.noisy_walls(around.x))
+        return slopes.eno2(around.value, around.grid, around.reflecting)
 
 
 @pytree_dataclass(static=("subcell", "split"))
@@ -332,10 +316,10 @@ class Weno5(Scheme):
 
     def slopes(self, around: Differences) -> Slopes:
         """Slopes weighted over three stencils; limited slopes near targets and unreachable nodes."""
-        grid, noisy = around.on.grid, around.on.noisy_walls(around.x)
-        found = slopes.weno5(around.value, grid, around.lost, noisy)
+        grid, noisy = around.grid, around.reflecting
+        found = slopes.weno5(around.value, grid, around.unreachable, noisy)
         for axis, (pair, link) in enumerate(zip(around.one_sided, around.links, strict=True)):
-            if (broken := slopes.broken_stencils(link, grid, axis, around.lost)) is not None:
+            if (broken := slopes.broken_stencils(link, grid, axis, around.unreachable)) is not None:
                 near, (up, down) = stencil.limited(*pair, grid, axis, link, noisy[axis]), found[axis]
                 found[axis] = jnp.where(broken, near[0], up), jnp.where(broken, near[1], down)
         return found

@@ -61,7 +61,7 @@ def weno5(values: Field, grid: Grid, lost: Mask | None = None, noisy: Noisy | No
     """
     most, least = (values, values) if lost is None else (jnp.where(lost, fill, values) for fill in (-jnp.inf, jnp.inf))
     # it only sets the unit of ε, so no derivative should pass through the nodes of the largest and the least V
-    extent = jax.lax.stop_gradient(grid.largest(most) - grid.least(least))
+    extent = jax.lax.stop_gradient(grid.layout.largest(most) - grid.layout.least(least))
     extent = jnp.where(extent > 0, extent, 1)  # a constant V has slopes zero in any unit
     result = []
     for axis in range(grid.ndim):

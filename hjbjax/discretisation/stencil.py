@@ -7,7 +7,7 @@ copy would move the wall outwards by half a spacing. Beyond an open end the valu
 through the last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} for equal spacings.
 
 If the nodes are divided among several devices, the values beyond the last node of a part are fetched from the adjacent
-part: see ``problem.parts``.
+part: see ``problem.layouts``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import Array, AtNodes, Field, Number, Scalar
+from hjbjax.problem.grid import CONTINUED, Grid, undivided
+from hjbjax.problem.pytree import altered, pytree_dataclass
+from hjbjax.problem.types import Array, AtNodes, Field, Number
+from hjbjax.tracing import checks
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -31,15 +32,9 @@ LONGER = 4  # number of axes up to which neighbours along the last one are slice
 
 def on_edge(grid: Grid, axis: int, step: int) -> Array:
     """The nodes without a neighbour in direction ``step`` along ``axis``, bool; broadcasts against the node axes."""
+    # (1, …, N, …, 1), since a constant of the size of the grid would be stored in every program
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
-    # the nodes on this device are known at run time only
-    if grid.parts is not None and (grid.is_divided(axis) or not grid.parts.even(axis)):
-        ended = jnp.asarray(not grid.periodic[axis])
-        return (grid.parts.last(axis, step) & ended).reshape(along)
-    # (1, …, N, …, 1) and on the host: a constant of the size of the grid would be stored in every program
-    mask = np.zeros(grid.shape[axis], dtype=bool)
-    mask[-1 if step > 0 else 0] = not grid.periodic[axis]
-    return mask.reshape(along)
+    return (grid.layout.last(axis, step) & (not grid.periodic[axis])).reshape(along)
 
 
 def has_walls(grid: Grid, axis: int) -> bool:
@@ -50,6 +45,12 @@ def has_walls(grid: Grid, axis: int) -> bool:
 def has_wall(grid: Grid, axis: int, step: int) -> bool:
     """True if an end stops drift and noise; False at open ends and where the slope is prescribed, as V continues."""
     return (axis, step) not in grid.sides("open") and (axis, step) not in grid.sides("neumann")
+
+
+def walled(grid: Grid) -> Grid:
+    """The grid with the ends of a Markov chain: projected ends instead of open, linear and Robin ends."""
+    pairs = (pair and tuple("projected" if name in CONTINUED else name for name in pair) for pair in grid.edges)
+    return altered(grid, edges=tuple(pairs))
 
 
 def sloped(grid: Grid, axis: int, step: int) -> Any:
@@ -92,7 +93,7 @@ def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
         return step * 2 * _last_gap(grid, axis, step) * getattr(end, "rate", 0.0), 1.0
     if grid.stretch[axis] is None:
         return 3.0, -3.0, 1.0
-    gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
+    gaps = jnp.diff(jnp.asarray(undivided(grid).axis(axis)))
     last, before = (gaps[-1], gaps[-2]) if step > 0 else (gaps[0], gaps[1])
     # Newton's form of the parabola at a distance ``last`` beyond the end; equal gaps give 3, −3, 1
     ratio, bend = last / before, 2 * last / (last + before)
@@ -103,7 +104,7 @@ def _last_gap(grid: Grid, axis: int, step: int) -> Number:
     """The distance between the end of an axis and the node next to it."""
     if grid.stretch[axis] is None:
         return grid.spacing(axis)
-    gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
+    gaps = jnp.diff(jnp.asarray(undivided(grid).axis(axis)))
     return gaps[-1] if step > 0 else gaps[0]
 
 
@@ -161,10 +162,7 @@ def slices(values: jax.Array, grid: Grid, axis: int, step: int, inwards: int = 0
     The array has values at the nodes, or varies along this axis and broadcasts. Slices are in the order of the nodes.
     On a divided axis they are next to the end of the local part.
     """
-    first: int | Scalar = inwards
-    if step > 0:
-        nodes = grid.shape[axis] if grid.parts is None else grid.parts.count(axis)
-        first = nodes - inwards - count
+    first = grid.layout.count(axis) - inwards - count if step > 0 else inwards
     if isinstance(first, int):
         return jax.lax.slice_in_dim(values, first, first + count, axis=axis)
     return jax.lax.dynamic_slice_in_dim(values, first, count, axis=axis)
@@ -173,9 +171,9 @@ def slices(values: jax.Array, grid: Grid, axis: int, step: int, inwards: int = 0
 def joined(values: AtNodes, grid: Grid, axis: int, below: jax.Array, above: jax.Array) -> jax.Array:
     """The values with the slices ``below`` and ``above`` joined along an axis, the latter after the last local node."""
     long = jnp.concatenate([below, values, above], axis=axis)
-    if grid.parts is None or grid.parts.even(axis):
+    if grid.layout.even(axis):
         return long
-    return jax.lax.dynamic_update_slice_in_dim(long, above, below.shape[axis] + grid.parts.count(axis), axis=axis)
+    return jax.lax.dynamic_update_slice_in_dim(long, above, below.shape[axis] + grid.layout.count(axis), axis=axis)
 
 
 def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) -> jax.Array:
@@ -183,15 +181,13 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
 
     ``ended`` contains the values beyond an end of the box, and determines the number of slices.
     """
-    cyclic = bool(grid.periodic[axis])
-    if not (cyclic or grid.is_divided(axis)):
+    cyclic, layout = bool(grid.periodic[axis]), grid.layout
+    if not (cyclic or layout.is_divided(axis)):
         return ended
     # the slices of the other side at the end that faces this one
     given = slices(values, grid, axis, -step, count=ended.shape[axis])
-    if grid.parts is None or not grid.is_divided(axis):
-        return given
-    found = grid.parts.fetched(given, axis, step, cyclic=cyclic)
-    return found if cyclic else jnp.where(grid.parts.at_end(axis, step), ended, found)
+    found = layout.fetched(given, axis, step, cyclic=cyclic)
+    return found if cyclic else jnp.where(layout.at_end(axis, step), ended, found)
 
 
 def _ended(values: AtNodes, grid: Grid, axis: int, step: int, *, change: bool = False) -> jax.Array:
@@ -224,10 +220,10 @@ def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bo
         else:
             parts = [jax.lax.slice_in_dim(values, 1, grid.shape[axis], axis=axis), outside]
         moved = jnp.concatenate(parts, axis=axis)  # fused, while a pad would fill an array
-        if step > 0 and grid.parts is not None and not grid.parts.even(axis):
+        if step > 0 and not grid.layout.even(axis):
             # the last entry may be padding of this part, and the one before it the last node
             place = jnp.arange(grid.shape[axis]).reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
-            moved = jnp.where(place == grid.parts.count(axis) - 1, outside, moved)
+            moved = jnp.where(place == grid.layout.count(axis) - 1, outside, moved)
         values = moved
     return values
 
@@ -257,13 +253,26 @@ def grid_links(grid: Grid, axis: int) -> Links:
     """The links of the grid along one axis; on a stretched axis an end node repeats its only distance."""
     if grid.stretch[axis] is None:
         return Links(grid.spacing(axis), grid.spacing(axis))
-    gaps = jnp.diff(jnp.asarray(grid.whole.axis(axis)))
+    gaps = jnp.diff(jnp.asarray(undivided(grid).axis(axis)))
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
     # N − 1 gaps for N nodes: beyond an end is the mirror image, or a parabola over a gap of the same length
     up, down = jnp.append(gaps, gaps[-1:]), jnp.append(gaps[:1], gaps)
-    if grid.parts is not None:
-        up, down = grid.parts.own(up, axis), grid.parts.own(down, axis)
+    up, down = grid.layout.own(up, axis), grid.layout.own(down, axis)
     return Links(up.reshape(along), down.reshape(along))
+
+
+def noise_along(a: dict[tuple[int, int], jax.Array], grid: Grid, axis: int) -> Any:
+    """a_ii − Σ_j |a_ij| h_i/h_j: the noise left for jumps along axis i after the diagonal jumps; None without any."""
+    left = a.get((axis, axis))
+    if left is None:
+        return None
+    for (i, j), entry in a.items():
+        if i != j:
+            checks.refuse_stretched(grid)  # between unequal cells there are no diagonals
+        if i != j and axis in (i, j):
+            other = j if axis == i else i
+            left = left - jnp.abs(entry) * (grid.spacing(axis) / grid.spacing(other))
+    return left
 
 
 def one_sided(values: Field, grid: Grid, axis: int, link: Links | None = None) -> tuple[Field, Field]:

@@ -107,7 +107,7 @@ class GridFilter:
         name = "GridFilter"
         if not isinstance(grid, Grid):
             raise TypeError(f"{name}: got {type(grid).__name__} for the grid, wanted a Grid")
-        grid.refuse_prescribed(name, "which prescribe V and not the law of the state")
+        checks.refuse_prescribed(grid, name, "which prescribe V and not the law of the state")
         if grid.sides("open"):
             raise ValueError(
                 f"{name}: got a grid with open ends, where mass would leave; choose edges='projected', and a box with "

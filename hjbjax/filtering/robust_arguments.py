@@ -28,7 +28,7 @@ def check_question(problem: object, grid: object, scheme: Any) -> None:
             f"robust_filter: got a problem with {what}, wanted drift (x, u) and cost (x, u). The disturbance of the "
             "filter is w, which pays ½γ²|w|²; remove the other one."
         )
-    grid.refuse_prescribed("robust_filter", "which prescribe V and not the information state p")
+    checks.refuse_prescribed(grid, "robust_filter", "which prescribe V and not the information state p")
     if grid.sides("open"):
         raise ValueError(
             "robust_filter: got a grid with open ends, through which unknown values of p would flow in; choose "

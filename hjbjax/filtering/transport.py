@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise, stencil
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.problem.grid import Grid
 
@@ -44,7 +44,7 @@ def corrections(on: Discretisation, u: list, axes: tuple[int, ...]) -> list[Corr
         return found
     drift, noise = on.drift(u), on.diffusion(u)
     for axis in axes:
-        link, a = stencil.grid_links(grid, axis), correlated_noise.along_axis(noise, grid, axis)
+        link, a = stencil.grid_links(grid, axis), stencil.noise_along(noise, grid, axis)
         for step, length in ((1, link.up), (-1, link.down)):
             # no flux crosses a wall; upwinding adds the diffusion h f, of which only the part above a is removed
             speed = jnp.where(stencil.wall(grid, axis, step), 0, jnp.maximum(step * drift[axis], 0))

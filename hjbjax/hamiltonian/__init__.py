@@ -1,6 +1,5 @@
 """The Hamiltonian at a node, and its min-max over the admissible sets, by exact formulas or by samples.
 
-Read ``discrete`` first. ``players`` finds how H depends on each player, ``exact`` finds exact optima by ``piecewise``,
-``ball`` or ``quadratic_program``, ``search`` has the searches, and ``pointwise`` the minimum at one state for
-Pontryagin's equations.
+Read ``discrete`` first. ``exact`` finds exact optima by ``piecewise``, ``ball`` or ``quadratic_program``, ``search``
+has the searches, and ``pointwise`` the minimum at one state for Pontryagin's equations.
 """

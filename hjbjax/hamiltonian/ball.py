@@ -8,7 +8,6 @@ compared by its own value. ``sign`` is +1 to minimise and −1 to maximise; all 
 
 import functools
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -68,11 +67,6 @@ def kinked_ball(
         best = challenger if best is None else pick(better(sign, challenger[0], best[0]), challenger, best)
     assert best is not None
     return best[1]
-
-
-def combinations(pieces: Sequence[int]) -> int:
-    """The number of combinations for inputs whose gains have the given numbers of pieces, with kinks between them."""
-    return math.prod(2 * count - 1 for count in pieces)
 
 
 def _branches(linear: PerNode, piece: Kinked[PerNode] | None) -> list[Branch]:

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise, cut_cells, edges, schemes, stencil
+from hjbjax.discretisation import edges, schemes, stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.problem import Problem
@@ -102,7 +102,7 @@ class DiscreteHamiltonian:
         total = self.on.running_cost(u, d, self.x)
         # one axis after the other, so that XLA fuses all of H into one pass over V
         for axis in range(grid.ndim):
-            total = total + self.gain(axis, first[axis], correlated_noise.along_axis(a, grid, axis))
+            total = total + self.gain(axis, first[axis], stencil.noise_along(a, grid, axis))
             for other in others:
                 total = total + self.gain(axis, other[axis], None)
         for (i, j), entry in a.items():
@@ -148,7 +148,7 @@ def around(
     grid = on.grid
     # otherwise XLA hoists products of coordinates out of the loop, one array of all nodes per action
     x, value = tie((on.coordinates(), value))
-    links = tuple(cut_cells.links(on))
+    links = on.links
     differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
     bends = tuple(stencil.bends(*pair, grid, axis) for axis, pair in enumerate(differences))
     slopes = on.scheme.slopes(Differences(on, x, value, links, differences, lost, first_order))

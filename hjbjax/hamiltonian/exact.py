@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import correlated_noise, stencil
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.players import Player, shared
 from hjbjax.discretisation.stencil import PerNode
 from hjbjax.hamiltonian import quadratic_program
 from hjbjax.hamiltonian.ball import kinked_ball
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.piecewise import Kinked, piecewise_input, piecewise_pair
-from hjbjax.hamiltonian.players import Player, players_of, shared
 from hjbjax.hamiltonian.quadratic_program import Program
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.grid import Grid
@@ -56,7 +56,7 @@ class _Part:
 
     def gain(self, axis: int, group: Sequence[int]) -> Kinked:
         """The gain of one component as a function of some inputs; for one input, its slope is a number per node."""
-        left = correlated_noise.along_axis(self.noise, self.hamiltonian.on.grid, axis)
+        left = stencil.noise_along(self.noise, self.hamiltonian.on.grid, axis)
         slope = [self.slopes[j][axis] for j in group]
         return Kinked(
             lambda f: self.hamiltonian.gain(axis, f, left), self.offsets[axis], slope[0] if len(group) == 1 else slope,
@@ -251,7 +251,7 @@ def _cost_coefficients(
 
 def needs_convexity(on: Discretisation) -> bool:
     """True if a player's optimum is exact only for a cost that is convex for a minimiser, concave for a maximiser."""
-    return any(_needs_convexity(player) for player in players_of(on).both)
+    return any(_needs_convexity(player) for player in on.players.both)
 
 
 def may_miss(on: Discretisation) -> Verdict | bool:
@@ -268,7 +268,7 @@ def _needs_convexity(player: Player) -> bool:
 @jax.jit
 def _is_concave(on: Discretisation) -> Verdict:
     """True if a cost is not convex for its player at some node, and the optimum requires convexity."""
-    players, found = players_of(on), jnp.zeros((), bool)
+    players, found = on.players, jnp.zeros((), bool)
     u, d = ([jnp.zeros((), on.dtype)] * len(player.driven) for player in players.both)
     arguments = on.problem.arguments(on.coordinates(), u, d, on.t)
     for player in filter(_needs_convexity, players.both):

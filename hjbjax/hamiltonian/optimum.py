@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from hjbjax.discretisation.players import SAMPLES, Player
 from hjbjax.hamiltonian import exact, search
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.piecewise import inverse_root
-from hjbjax.hamiltonian.players import SAMPLES, Player, players_of
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
 from hjbjax.problem import sets
 from hjbjax.problem.pytree import altered, tie
@@ -26,7 +26,7 @@ INNER = 8  # actions of the player who moves second to write out, inside the sea
 
 def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:
     """min max of H, or max min, as in the problem or ``isaacs``: the value, the control and the disturbance."""
-    players = players_of(hamiltonian.on)
+    players = hamiltonian.on.players
     if players.disturbance.admissible is None:
         value, u = best_response(hamiltonian, players.control, lambda u: (u, []))
         return value, u, []
@@ -43,7 +43,7 @@ def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tup
 
 def optimal_value(hamiltonian: DiscreteHamiltonian) -> jax.Array:
     """min max of H, or max min, without the actions, which is faster for a finite set."""
-    players = players_of(hamiltonian.on)
+    players = hamiltonian.on.players
     player, admissible = players.control, players.control.admissible
     if players.disturbance.admissible is not None or not isinstance(admissible, Finite):
         return optimise(hamiltonian)[0]
@@ -56,7 +56,7 @@ def missed(hamiltonian: DiscreteHamiltonian) -> tuple[Field, Field]:
 
     Zero except for quadratic programs, see ``exact.optimum_error``. They do not cover optima found by a search.
     """
-    players = players_of(hamiltonian.on)
+    players = hamiltonian.on.players
     (control, disturbance), none = players.both, jnp.zeros(hamiltonian.value.shape, hamiltonian.on.dtype)
     if disturbance.admissible is None or players.decoupled:
         u, d = (_any_action(each.admissible) for each in players.both)
@@ -121,7 +121,7 @@ def _admissible(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable
         return None
     # without the cost H is the gain, infinite for actions that leave; its minimum is exact for an affine drift
     free = altered(hamiltonian.on.problem, cost=None)
-    alone = players_of(hamiltonian.asking(free).on).control
+    alone = hamiltonian.asking(free).on.players.control
     return exact.exact_optimum(hamiltonian.asking(free), alone, join) if alone.exact else None
 
 

@@ -20,11 +20,11 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.players import SAMPLES, Player
 from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
-from hjbjax.hamiltonian.players import SAMPLES, Player, players_of
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem import sets
 from hjbjax.problem.sets import Ball, Box
@@ -94,7 +94,7 @@ def actions(on: Discretisation, value: Field, lost: jax.Array | None, u: Action,
       lost: the nodes to which no action may lead, bool (*grid), or None.
       u, d: the actions that were found, each input (*grid).
     """
-    players = players_of(on)
+    players = on.players
     # the choice of branches is frozen: to first order no node changes its branch
     kept, u, d = jax.lax.stop_gradient(((on, value), list(u), list(d)))
     at = Optimum(discrete.around(on, value, lost), discrete.around(*kept, lost), u, d)
@@ -250,7 +250,7 @@ def _passed(hamiltonian: DiscreteHamiltonian, axes: Collection[int], u: Action, 
     for number, part in enumerate(on.drifts(u, d)):
         noise = {} if number else on.diffusion(u, d)  # if drifts are upwinded separately, it belongs to the first
         for axis in sorted(axes):
-            left = correlated_noise.along_axis(noise, on.grid, axis)
+            left = stencil.noise_along(noise, on.grid, axis)
             found += [part[axis] - kink for kink in hamiltonian.kinks(axis, left)[0]]
     return [jnp.broadcast_to(jnp.asarray(beyond, on.dtype), on.grid.shape) for beyond in found]
 

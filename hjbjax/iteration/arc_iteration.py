@@ -180,7 +180,7 @@ def _bound(task: ArcTask, value: Field, found: _Look) -> ErrorBound:
     defect = jnp.where(left > 0, left / _unit(best), -found.decline)
     residual = left if obstacles.upper is None else jnp.where(free, jnp.minimum(left, obstacles.upper - value), 0)
     iterate = Iterate(
-        task.grid, value, Greedy(jnp.where(free, defect, 0), (), ()), PolicyEquation(residual, Rates((), ())),
+        task.grid.layout, value, Greedy(jnp.where(free, defect, 0), (), ()), PolicyEquation(residual, Rates((), ())),
         obstacles, task.counted,
     )  # fmt: skip
     one = jnp.ones((), value.dtype)

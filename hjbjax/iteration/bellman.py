@@ -17,11 +17,10 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from hjbjax.discretisation import cut_cells, edges, stencil
+from hjbjax.discretisation import edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, fastest_rate, jump_rates
 from hjbjax.hamiltonian import discrete, optimum
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
@@ -109,7 +108,7 @@ def obstacles(on: Discretisation) -> Obstacles:
         None if ingredient is None else on.at_nodes(ingredient)
         for ingredient in (problem.exit_cost, problem.stopping_cost, problem.running_max)
     )
-    held = jnp.zeros(on.grid.shape, bool) if problem.target is None else cut_cells.level(on) <= 0
+    held = jnp.zeros(on.grid.shape, bool) if problem.target is None else on.level <= 0
     # outside the target the exit cost is irrelevant and may be NaN
     given = jnp.zeros((), on.dtype) if exit_cost is None else jnp.where(held, exit_cost, 0)
     for axis, step, end in on.grid.prescribed("dirichlet"):
@@ -143,7 +142,7 @@ def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -
     used, at best in a single pass over V.
     """
     hamiltonian = dataclasses.replace(discrete.around(on, value), bare=outflow is None)
-    players, discount = players_of(on), on.decay
+    players, discount = on.players, on.decay
     outflow = fastest_rate(on) + discount if outflow is None else outflow
     if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
         best = optimum.optimal_value(hamiltonian)
@@ -180,7 +179,7 @@ def respond(
     first_order: jax.Array | None = None,
 ) -> Greedy:
     """The inner player's best response to the outer player's current policy, in a game; masks as in ``greedy``."""
-    players = players_of(on)
+    players = on.players
     # the current response is among the candidates, so a sampled player never gets worse
     hamiltonian = _around(on, value, current, lost, first_order)
     u, d = list(current.controls), list(current.disturbances)
@@ -228,7 +227,7 @@ def policy_equation(
     if every_rate:
         outflow = jnp.where(leaving > 0, leaving, 1)
     else:
-        fastest = on.grid.largest(leaving) if fastest is None else fastest
+        fastest = on.grid.layout.largest(leaving) if fastest is None else fastest
         moves = leaving > 8 * jnp.finfo(value.dtype).eps * fastest  # a drift that cancels leaves rounding
         # where nothing moves the cost accumulates
         outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))
@@ -241,9 +240,7 @@ def policy_equation(
         floored = ~obstacles.fixed & (obstacles.lower - value > source)
         source, free = jnp.where(floored, obstacles.lower - value, source), free & ~floored
     weights = rates.scaled(jnp.where(free, 1 / outflow, 0))
-    if (
-        on.scheme.subcell and on.problem.target is not None
-    ):  # links to fixed nodes end on the boundary of the target, where the correction is zero
+    if on.cuts_links:  # links to fixed nodes end on the boundary of the target, where the correction is zero
         loose = ~obstacles.fixed
         jumps = zip(weights.offsets, weights.values, strict=True)
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
@@ -270,4 +267,4 @@ def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) 
         leaking = leaking + leak  # rates per unit time, (*grid): several small leaks add up
     # relative to all rates of the node, since terms of the drift may cancel up to their rounding
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()
-    return grid.some(~lost & ~held & (leaking > limit))
+    return grid.layout.some(~lost & ~held & (leaking > limit))

@@ -28,7 +28,7 @@ import numpy as np
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Field, Mask, Number, Scalar
 
@@ -73,7 +73,7 @@ class Iterate:
     """A value function with its policy and the residual of its equation.
 
     Attributes:
-      grid: the grid.
+      layout: the layout of the nodes.
       value: V, (*grid).
       policy: the greedy policy at V with its defect r, zero at fixed nodes.
       equation: its correction equation, whose source is the residual.
@@ -81,7 +81,7 @@ class Iterate:
       counted: bool (*grid), the nodes whose error counts (those that reach the target).
     """
 
-    grid: Grid
+    layout: Layout
     value: Field
     policy: Greedy
     equation: PolicyEquation
@@ -113,7 +113,7 @@ def error_bound(
             endless = jnp.full_like(without.residual, jnp.inf)
             without = dataclasses.replace(without, above=endless, lift=endless)
         return jax.tree.map(lambda mine, theirs: jnp.where(discount > 0, mine, theirs), with_it, without)
-    residual = iterate.grid.largest(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
+    residual = iterate.layout.largest(jnp.where(iterate.counted, jnp.abs(iterate.equation.source), 0))
     if kind is Certificate.ADDITIVE:
         below, above = _additive(iterate, discount)
         error = jnp.maximum(jnp.abs(below), jnp.abs(above))
@@ -141,18 +141,18 @@ def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[
     zero = jnp.zeros((), value.dtype)
     if kind is Certificate.ADDITIVE:
         defect = jax.lax.optimization_barrier(defect)
-        error = on.grid.largest(jnp.abs(given.clipped(defect / on.problem.discount, value)))
+        error = on.grid.layout.largest(jnp.abs(given.clipped(defect / on.problem.discount, value)))
         return given.clipped(defect / outflow, value), ErrorBound(-error, error, zero, error, error)
     step = given.clipped(jax.lax.optimization_barrier(defect / outflow), value)
-    residual = on.grid.largest(jnp.abs(step))
+    residual = on.grid.layout.largest(jnp.abs(step))
     return step, ErrorBound(zero, zero, zero, residual, residual)
 
 
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
     """The minimum and maximum of ρ = max(min(r/β, ψ − V), g − V)."""
-    grid, value, policy, obstacles = iterate.grid, iterate.value, iterate.policy, iterate.obstacles
+    layout, value, policy, obstacles = iterate.layout, iterate.value, iterate.policy, iterate.obstacles
     if obstacles.upper is None and obstacles.lower is None:  # reductions first, without an array r/β
-        return grid.least(policy.defect) / discount, grid.largest(policy.defect) / discount
+        return layout.least(policy.defect) / discount, layout.largest(policy.defect) / discount
     shift = policy.defect / discount
     if obstacles.upper is not None:
         shift = jnp.minimum(shift, obstacles.upper - value)
@@ -160,13 +160,13 @@ def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
         shift = jnp.maximum(shift, obstacles.lower - value)
     # at fixed nodes r is zero, the constraints need not be; V is exact there
     shift = jnp.where(obstacles.fixed, 0, shift)
-    return grid.least(shift), grid.largest(shift)
+    return layout.least(shift), layout.largest(shift)
 
 
 def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> ErrorBound:
     """V/(1 + η) ≤ V_h ≤ V/(1 − ρ) for V shifted so that no exit cost is negative."""
     value, policy, obstacles, counted = iterate.value, iterate.policy, iterate.obstacles, iterate.counted
-    grid, costs = iterate.grid, least_cost > 0
+    layout, costs = iterate.layout, least_cost > 0
     free = counted & ~obstacles.fixed
     # where L = 0 any defect is infinite relative to the cost; r = 0 gives NaN from sign · ∞, but ``priced`` is false
     # then anyway
@@ -174,14 +174,14 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     relative = jnp.where(free, rate, 0)
     # where V = ψ only ψ, which is imposed, bounds V_h from above
     rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
-    rho, eta = jnp.maximum(grid.largest(rising), 0), jnp.maximum(grid.largest(-relative), 0)
+    rho, eta = jnp.maximum(layout.largest(rising), 0), jnp.maximum(layout.largest(-relative), 0)
     # as numbers: for booleans XLA would make two passes
-    priced = grid.largest(jnp.asarray(free & ~costs, value.dtype)) == 0
+    priced = layout.largest(jnp.asarray(free & ~costs, value.dtype)) == 0
     sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # where V is flat, r = L up to rounding
     below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
-    lift = jnp.maximum(-lowest_end(obstacles, counted, grid), 0)
+    lift = jnp.maximum(-lowest_end(obstacles, counted, layout), 0)
     apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # avoids 0 · inf
-    least, most = (grid.least(jnp.where(counted, value, jnp.inf)), grid.largest(jnp.where(counted, value, -jnp.inf)))
+    least, most = layout.least(jnp.where(counted, value, jnp.inf)), layout.largest(jnp.where(counted, value, -jnp.inf))
     # the scaling argument requires V ≥ 0; otherwise there is no bound
     bounded = jnp.isfinite(above) & (least + lift >= 0)
     error = jnp.where(bounded, jnp.maximum(most + lift, 0) * apart, jnp.inf) + 0 * residual  # keeps NaN
@@ -220,14 +220,14 @@ def widen_bounds(
     return dataclasses.replace(bound, below=below, above=above)
 
 
-def lowest_end(obstacles: Obstacles, counted: Mask | bool, grid: Grid) -> Scalar:
+def lowest_end(obstacles: Obstacles, counted: Mask | bool, layout: Layout) -> Scalar:
     """The least payment at the end of a run, at most zero: exit costs, also between nodes, and ψ."""
-    lowest = grid.least(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0))
+    lowest = layout.least(jnp.where(counted & obstacles.fixed, obstacles.fixed_value, 0))
     lowest = jnp.minimum(lowest, obstacles.least_exit)
     # ψ is paid on stopping, which is possible anywhere
-    return (
-        lowest if obstacles.upper is None else jnp.minimum(lowest, grid.least(jnp.where(counted, obstacles.upper, 0)))
-    )
+    if obstacles.upper is None:
+        return lowest
+    return jnp.minimum(lowest, layout.least(jnp.where(counted, obstacles.upper, 0)))
 
 
 def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = None) -> Any:

@@ -8,7 +8,7 @@ convergence took the Dubins car on 41³ nodes 135 steps instead of 33.
 import jax
 import jax.numpy as jnp
 
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Scalar
 
@@ -61,14 +61,14 @@ class Moves:
         return moved + jnp.maximum(moved - rounding, 0) * rate / (1 - rate)
 
 
-def turns_back(grid: Grid, change: Field, defect: Field) -> jax.Array:
+def turns_back(layout: Layout, change: Field, defect: Field) -> jax.Array:
     """True if a correction overshot: where V changed most, its equation now requires the opposite change.
 
     Args:
-      grid: the grid.
+      layout: the layout of the nodes.
       change: the last change of V, zero at nodes that do not count, cost units, (*grid).
       defect: the residual at the new V, positive where V should increase, cost per unit time, (*grid).
     """
-    most = jnp.abs(change) > grid.largest(jnp.abs(change)) / 2
+    most = jnp.abs(change) > layout.largest(jnp.abs(change)) / 2
     onwards = jnp.where(most, jnp.sign(change) * defect, 0)
-    return grid.largest(-onwards) > grid.largest(onwards)
+    return layout.largest(-onwards) > layout.largest(onwards)

@@ -41,6 +41,7 @@ from hjbjax.iteration import gauss_seidel
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Field, Number, Scalar, Verdict
 
@@ -149,7 +150,7 @@ class Krylov(Evaluation):
         fraction = self.fraction
         if grid.sides("open"):  # with 1e-3 the errors of the solves led a time step to another solution
             fraction = jnp.minimum(fraction, OPEN_FRACTION)
-        return bicgstab(matvec, precondition, equation.source, grid, fraction=fraction, most=self.max_steps)
+        return bicgstab(matvec, precondition, equation.source, grid.layout, fraction=fraction, most=self.max_steps)
 
     def bytes_per_node(self, weights: int, word: int) -> int:
         """The weights twice, and the vectors of BiCGStab."""
@@ -215,7 +216,7 @@ def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:
     delta = method.solve(equation, grid)
     if method.rough:  # its residual is checked in the next step
         return delta
-    size, left = grid.largest(jnp.abs(equation.source)), grid.largest(jnp.abs(left_over(equation, grid, delta)))
+    size, left = (grid.layout.largest(jnp.abs(each)) for each in (equation.source, left_over(equation, grid, delta)))
     # an improper policy has no value, and BiCGStab may break down; relaxation is always safe
     return jax.lax.cond(left <= size, lambda: delta, lambda: relaxed(equation, grid, 2))
 
@@ -238,7 +239,7 @@ def bicgstab(
     matvec: Callable[[Field], Field],
     precondition: Callable[[Field], Field],
     source: Field,
-    grid: Grid,
+    layout: Layout,
     *,
     fraction: Number,
     most: int,
@@ -251,13 +252,13 @@ def bicgstab(
       matvec: A.
       precondition: approximately A⁻¹.
       source: the right-hand side, (*grid).
-      grid: the grid.
+      layout: the layout of the nodes.
       fraction: the target for the 2-norm of the residual, relative to the source.
       most: largest number of steps.
     """
 
     def dot(a: Field, b: Field) -> Scalar:
-        return grid.total(a * b)
+        return layout.total(a * b)
 
     least = jnp.square(jnp.asarray(fraction, source.dtype)) * dot(source, source)
 

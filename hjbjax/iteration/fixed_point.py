@@ -14,23 +14,25 @@ takes 0.7 s to compile.
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import Rates, jump_rates
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates, damping, methods, progress
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
 from hjbjax.iteration.certificates import TO_THE_END, Certificate, ErrorBound, Iterate
 from hjbjax.iteration.damping import Moves
 from hjbjax.iteration.evaluation import Evaluation, evaluate
+from hjbjax.iteration.grid_task import GridTask
 from hjbjax.iteration.methods import Method
 from hjbjax.iteration.progress import Progress, keep_finite
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, undivided
 from hjbjax.problem.problem import Problem, is_constrained
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
@@ -39,8 +41,8 @@ from hjbjax.solution.status import Status
 FEW = 4  # ``progress.ROUNDING`` of a solve that stores only V, whose steps are small at slow nodes
 
 
-@pytree_dataclass(static=("certificate", "has_lost", "bare"))
-class Task:
+@pytree_dataclass(static=("certificate", "has_lost", "bare", "mesh"))
+class Task(GridTask):
     """The constants of a solve: the problem on its grid, the method, and the error bound.
 
     Args:
@@ -59,6 +61,7 @@ class Task:
         serves both; None: always the scheme itself. Only without noise.
       floor: a lower bound on all values, cost units, for a high-order scheme; None if there is none.
       shift: an addition to the discount in high-order corrections, per unit time; None: nothing.
+      mesh: the devices over which the nodes are divided during the iteration; None: one device.
     """
 
     on: Discretisation
@@ -75,16 +78,7 @@ class Task:
     first_order: Any = None
     floor: Any = None
     shift: Any = None
-
-    @property
-    def problem(self) -> Problem:
-        """The problem."""
-        return self.on.problem
-
-    @property
-    def grid(self) -> Grid:
-        """The grid."""
-        return self.on.grid
+    mesh: Mesh | None = None
 
     @property
     def scheme(self) -> Scheme:
@@ -126,7 +120,7 @@ class Task:
         additive = self.certificate is Certificate.ADDITIVE and self.first_order is None
         if not (self.method.by_defect and additive) or self.bare:
             return False
-        players = players_of(self.on)
+        players = self.on.players
         at_ends = players.control.fastest_at_ends and players.disturbance.fastest_at_ends
         return at_ends and players.exact and self.scheme.monotone
 
@@ -141,7 +135,7 @@ class Task:
         if not self.has_lost:
             return value
         # 1/√eps above: no minimum selects it, and a difference with it still has half of its digits
-        largest = self.grid.largest(jnp.where(self.counted, jnp.abs(value), 0))
+        largest = self.layout.largest(jnp.where(self.counted, jnp.abs(value), 0))
         return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
 
     @property
@@ -164,12 +158,12 @@ class Task:
     def size(self, value: Field) -> Scalar:
         """The largest |V| at the counted nodes."""
         if not jnp.ndim(self.counting):  # all nodes count: no array of |V|
-            return jnp.maximum(self.grid.largest(value), -self.grid.least(value))
-        return self.grid.largest(jnp.where(self.counting, jnp.abs(value), 0))
+            return jnp.maximum(self.layout.largest(value), -self.layout.least(value))
+        return self.layout.largest(jnp.where(self.counting, jnp.abs(value), 0))
 
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source| at the counted nodes, in cost units."""
-        return self.grid.largest(jnp.where(self.counting, jnp.abs(equation.source), 0))
+        return self.layout.largest(jnp.where(self.counting, jnp.abs(equation.source), 0))
 
     def start(self) -> Field:
         """The value without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
@@ -210,7 +204,7 @@ def start(task: Task, guess: Nodes) -> State:
     traced, dtype = is_traced(task, guess), guess.dtype
     xp: Any = jnp if traced else np
     copied: Any = jnp.array if traced else functools.partial(jax.device_put, may_alias=False)
-    value: Any = copied(guess) if task.on.parts is None else guess
+    value: Any = copied(guess) if not task.division.axes else guess
     shape = () if task.bare else task.grid.shape  # of the policy
     players = (None if task.bare else admissible for admissible in (task.problem.controls, task.problem.disturbances))
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
@@ -228,7 +222,7 @@ def run(task: Task, state: State, until: Number) -> State:
         # made loop-variant, otherwise XLA compiles a kernel for every scalar of every action that it can hoist
         variant = task.problem.controls, task.grid, state.progress.evaluations
         controls, grid, count = jax.lax.optimization_barrier(variant)
-        on = dataclasses.replace(task.on, problem=altered(task.problem, controls=controls), grid=grid)
+        on = altered(task.on, problem=altered(task.problem, controls=controls), grid=grid)
         state = dataclasses.replace(state, progress=dataclasses.replace(state.progress, evaluations=count))
         return _advance(dataclasses.replace(task, on=on), state, chunk)
 
@@ -253,7 +247,7 @@ def _advance(task: Task, state: State, chunk: Scalar) -> State:
     value = task.impose(state.value + delta)
     # a node that does not count may change indefinitely
     change = jnp.where(task.counting, value - state.value, 0)
-    moved = task.grid.largest(jnp.abs(change))
+    moved = task.layout.largest(jnp.abs(change))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
     moved = jnp.where(first, jnp.inf, moved)  # without a step there is no measure of the distance
@@ -263,7 +257,7 @@ def _advance(task: Task, state: State, chunk: Scalar) -> State:
         distance = jnp.where(task.is_chain, moved, moves.distance(moved, rounding))
     policy, fastest, bound = _evaluate(task, value, state.policy, moved=distance, first=first)
     if not task.scheme.monotone:
-        moves = moves.after(moved, damping.turns_back(task.grid, change, policy.defect))
+        moves = moves.after(moved, damping.turns_back(task.layout, change, policy.defect))
     measured = state.progress.measure(bound, chunk)
     code = status_after(task, value, bound, measured, moved)
     after = State(value, policy, fastest, bound, moves, measured.judge(bound, code))
@@ -277,7 +271,7 @@ def _relaxed(task: Task, state: State, chunk: Scalar) -> State:
     # the bound on the next value would require an array of its own
     first, measured = _is_first(state), state.progress.measure(bound, chunk)
     after = jnp.where(first, value, task.impose(value + step))
-    moved = jnp.where(first, jnp.inf, task.grid.largest(jnp.abs(after - state.value)))
+    moved = jnp.where(first, jnp.inf, task.layout.largest(jnp.abs(after - state.value)))
     code = status_after(task, state.value, bound, measured, moved)
     found = dataclasses.replace(state, value=after, bound=bound, progress=measured.judge(bound, code))
     return keep_finite(code, found, dataclasses.replace(state, progress=found.progress))
@@ -290,7 +284,7 @@ def _relaxed_by_defect(task: Task, state: State, chunk: Scalar) -> State:
     defect = jnp.where(task.obstacles.fixed, 0, bellman.relaxation(task.on, value, task.outflow)[0])
     policy = dataclasses.replace(state.policy, defect=defect)
     left = PolicyEquation(task.obstacles.clipped(defect / task.outflow, value), Rates((), ()))
-    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counting)
+    iterate = Iterate(task.layout, value, policy, left, task.obstacles, task.counting)
     bound = certificates.error_bound(task.certificate, iterate, discount=task.problem.discount)
     measured = state.progress.measure(bound, chunk)
     code = status_after(task, value, bound, measured)
@@ -314,11 +308,11 @@ def status_after(task: Task, value: Field, bound: ErrorBound, measured: Progress
       measured: the record with this evaluation, and the least error and residual before it.
       moved: the largest change of V; infinite if there was no step.
     """
-    longest: Number = task.method.patience(task.grid.whole)
+    longest: Number = task.method.patience(undivided(task.grid))
     climbs = task.constrained or task.method.relaxes
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
     if to_the_end:  # a front moves V at every node by the spacing times the slope, one step after the other
-        longest = jnp.maximum(longest, 100 + 4 * task.grid.whole.size)
+        longest = jnp.maximum(longest, 100 + 4 * math.prod(task.layout.whole))
     best, since = measured.best, measured.since_best
 
     def converged(code: Any, tol: Scalar) -> Scalar:
@@ -375,7 +369,7 @@ def nonfinite_nodes(task: Task, state: State) -> jax.Array:
 def _shift(task: Task, state: State) -> Scalar:
     """κ of the next correction, per unit time, with open ends."""
     assert task.outflow is not None
-    return methods.shift(task.grid.largest(task.outflow), jnp.maximum(state.progress.evaluations - 1, 0))
+    return methods.shift(task.layout.largest(task.outflow), jnp.maximum(state.progress.evaluations - 1, 0))
 
 
 def _evaluate(
@@ -390,7 +384,7 @@ def _evaluate(
         fixed = task.obstacles.fixed | first  # there are no actions to keep
         policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)
-    iterate = Iterate(task.grid, value, policy, left, task.obstacles, task.counting)
+    iterate = Iterate(task.layout, value, policy, left, task.obstacles, task.counting)
     known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
     bound = certificates.error_bound(task.certificate, iterate, **known)
     if task.first_order is not None:  # the chain's certificate does not apply to another scheme
@@ -420,7 +414,7 @@ class _At:
 
     def relaxed(self) -> Field:
         """r/(Q + β) for the fastest action; without ``outflow`` the policy's own rate is used."""
-        task, policy, players = self.task, self.state.policy, players_of(self.task.on)
+        task, policy, players = self.task, self.state.policy, self.task.on.players
         assert task.outflow is not None
         if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
             return policy.defect / task.outflow

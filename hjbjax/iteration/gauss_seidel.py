@@ -29,7 +29,6 @@ import numpy as np
 from hjbjax.discretisation import stencil
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Parts
 from hjbjax.problem.types import Field, Scalar
 
 Index: TypeAlias = int | Scalar  # of a slice; traced inside a loop
@@ -48,22 +47,22 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     The orders are one loop, so that one program serves them all and its operands are arrays in memory: a fused gather
     would compute every entry separately.
     """
-    layout = _layout(grid)
-    equation = _laid_out(equation, layout)
+    arrays = _arrays_of(grid)
+    equation = _with_layers(equation, arrays)
     # information crosses one part per sweep
-    rounds += max(layout.parts.sizes) // FURTHER if layout.parts else 0
+    rounds += max(grid.layout.sizes) // FURTHER
 
     def order(index: jax.Array, delta: jax.Array) -> jax.Array:
         # one bit per axis beyond the first; forward and backward sweeps are the two directions along the first
         flips = [(index >> axis) & 1 for axis in range(grid.ndim - 1)]
         source = _sheared(equation.source, flips)
-        weights = [_towards(equation, layout, axis, flips) for axis in range(grid.ndim)]
+        weights = [_towards(equation, arrays, axis, flips) for axis in range(grid.ndim)]
 
         def whole(planes: jax.Array) -> jax.Array:
-            return _in_turns(source, weights, planes, layout, rounds, flips)
+            return _in_turns(source, weights, planes, arrays, rounds, flips)
 
         def in_slabs(planes: jax.Array) -> jax.Array:
-            return _in_slabs(source, weights, planes, layout, rounds, flips)
+            return _in_slabs(source, weights, planes, arrays, rounds, flips)
 
         # a margin of one entry next to the axes beyond the first, so that neighbours are slices without a branch
         planes = jnp.pad(_sheared(delta, flips), _margins(grid.ndim))
@@ -74,12 +73,12 @@ def sweep(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
         return _from_planes(planes, flips)
 
     delta = jax.lax.fori_loop(0, 2 ** (grid.ndim - 1), order, jnp.zeros_like(equation.source))
-    inside = tuple(slice(1, -1) if layout.is_divided(axis) else slice(None) for axis in range(grid.ndim))
-    return jnp.moveaxis(delta[inside], 0, layout.axes[0])
+    inside = tuple(slice(1, -1) if arrays.is_divided(axis) else slice(None) for axis in range(grid.ndim))
+    return jnp.moveaxis(delta[inside], 0, arrays.axes[0])
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
+class Arrays:
     """The arrangement of the grid's axes in the arrays of a sweep, and the additional layers.
 
     Attributes:
@@ -90,37 +89,32 @@ class Layout:
     grid: Grid
     axes: tuple[int, ...]
 
-    @property
-    def parts(self) -> Parts | None:
-        """The parts of the nodes over several devices; None if all nodes are on one device."""
-        return self.grid.parts
-
     def is_divided(self, axis: int) -> bool:
         """True if an axis of the arrays has a layer on both sides, for the nodes on other devices."""
-        return self.grid.is_divided(self.axes[axis])
+        return self.grid.layout.is_divided(self.axes[axis])
 
     def closes(self, axis: int) -> bool:
         """True if an axis of the arrays is periodic and not divided."""
         return bool(self.grid.periodic[self.axes[axis]]) and not self.is_divided(axis)
 
 
-def _layout(grid: Grid) -> Layout:
-    """The layout with the axes in order; if a part is so flat that hyperplanes would fold often, longest axis first."""
+def _arrays_of(grid: Grid) -> Arrays:
+    """The arrays with the axes in order; if a part is so flat that hyperplanes would fold often, longest axis first."""
     axes = list(range(grid.ndim))
-    if grid.parts is not None and _folds(grid.shape) > FOLDS:
+    if grid.layout.axes and _folds(grid.shape) > FOLDS:
         axes.sort(key=lambda axis: axis != int(np.argmax(grid.shape)))
-    return Layout(grid, tuple(axes))
+    return Arrays(grid, tuple(axes))
 
 
-def _laid_out(equation: PolicyEquation, layout: Layout) -> PolicyEquation:
+def _with_layers(equation: PolicyEquation, arrays: Arrays) -> PolicyEquation:
     """The equation with a layer of zeros on both sides of every divided axis; filler nodes are zeroed too."""
-    parts = layout.parts
-    if parts is None:
+    layout = arrays.grid.layout
+    if not layout.axes:
         return equation
-    widths = [(int(layout.is_divided(axis)),) * 2 for axis in range(layout.grid.ndim)]
+    widths = [(int(arrays.is_divided(axis)),) * 2 for axis in range(arrays.grid.ndim)]
 
     def lay(leaf: jax.Array) -> jax.Array:
-        return jnp.pad(jnp.moveaxis(parts.cleared(leaf), layout.axes[0], 0), widths) if leaf.ndim else leaf
+        return jnp.pad(jnp.moveaxis(layout.cleared(leaf), arrays.axes[0], 0), widths) if leaf.ndim else leaf
 
     return jax.tree.map(lay, equation)
 
@@ -128,19 +122,18 @@ def _laid_out(equation: PolicyEquation, layout: Layout) -> PolicyEquation:
 Carried = tuple[jax.Array, jax.Array]  # planes, and the source, whose layers change between pairs of sweeps
 
 
-def _exchanged(carried: Carried, layout: Layout, flips: list[jax.Array]) -> Carried:
+def _exchanged(carried: Carried, arrays: Arrays, flips: list[jax.Array]) -> Carried:
     """Planes and source, with the δ of the nodes beyond this part in the layers around it."""
-    (planes, source), parts = carried, layout.parts
-    for axis in range(source.ndim) if parts is not None else ():
-        if not layout.is_divided(axis):
+    (planes, source), layout = carried, arrays.grid.layout
+    for axis in range(source.ndim):
+        if not arrays.is_divided(axis):
             continue
-        assert parts is not None
-        along = layout.axes[axis]
-        count, cyclic = parts.count(along), bool(layout.grid.periodic[along])
+        along = arrays.axes[axis]
+        count, cyclic = layout.count(along), bool(arrays.grid.periodic[along])
         for step, first, layer in ((1, 1, count + 1), (-1, count, 0)):
             # the adjacent part requires the node of this part at that end; indices count the layer
             given = planes.at[_within(_places(source.shape, axis, first, flips))].get(**KNOWN)
-            found, there = parts.fetched(given, along, step, cyclic=cyclic), _places(source.shape, axis, layer, flips)
+            found, there = layout.fetched(given, along, step, cyclic=cyclic), _places(source.shape, axis, layer, flips)
             planes = planes.at[_within(there)].set(found, **KNOWN)
             source = source.at[there].set(found, **KNOWN)
     return planes, source
@@ -178,25 +171,25 @@ def _outgrows_the_cache(source: jax.Array, weights: Weights) -> bool:
 
 
 def _in_turns(
-    source: jax.Array, weights: Weights, planes: jax.Array, layout: Layout, rounds: int, flips: list[jax.Array]
+    source: jax.Array, weights: Weights, planes: jax.Array, arrays: Arrays, rounds: int, flips: list[jax.Array]
 ) -> jax.Array:
     """Sweep all slices upwards and downwards, ``rounds`` times."""
 
     def sweep(k: jax.Array, planes: jax.Array, source: jax.Array = source) -> jax.Array:
         # one program for both directions
-        return _sweep(source, weights, _wrapped(planes, layout), 0, len(source), up=k % 2 == 0)
+        return _sweep(source, weights, _wrapped(planes, arrays), 0, len(source), up=k % 2 == 0)
 
     def pair(_: Index, carried: Carried) -> Carried:
-        planes, source = _exchanged(carried, layout, flips)
+        planes, source = _exchanged(carried, arrays, flips)
         return jax.lax.fori_loop(0, 2, functools.partial(sweep, source=source), planes), source
 
-    if layout.parts is None:
+    if not arrays.grid.layout.axes:
         return jax.lax.fori_loop(0, 2 * rounds, sweep, planes)
     return jax.lax.fori_loop(0, rounds, pair, (planes, source))[0]
 
 
 def _in_slabs(
-    source: jax.Array, weights: Weights, planes: jax.Array, layout: Layout, rounds: int, flips: list[jax.Array]
+    source: jax.Array, weights: Weights, planes: jax.Array, arrays: Arrays, rounds: int, flips: list[jax.Array]
 ) -> jax.Array:
     """Sweep slab after slab upwards and then downwards, each slab back and forth while it is in the cache.
 
@@ -207,7 +200,7 @@ def _in_slabs(
     slabs = -(-count // SLAB)  # the last one may be shorter
 
     def way(k: jax.Array, carried: Carried) -> Carried:
-        upwards, (planes, source) = k == 0, _exchanged(carried, layout, flips)
+        upwards, (planes, source) = k == 0, _exchanged(carried, arrays, flips)
 
         def slab(index: jax.Array, planes: jax.Array) -> jax.Array:
             first = SLAB * jnp.where(upwards, index, slabs - 1 - index)
@@ -219,15 +212,15 @@ def _in_slabs(
             return jax.lax.fori_loop(0, max(2 * rounds - 1, 3), sweep, planes)
 
         # fill the margins once per direction: doing so between slabs would read all planes
-        return jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, layout)), source
+        return jax.lax.fori_loop(0, slabs, slab, _wrapped(planes, arrays)), source
 
     return jax.lax.fori_loop(0, 2, way, (planes, source))[0]
 
 
-def _towards(equation: PolicyEquation, layout: Layout, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
+def _towards(equation: PolicyEquation, arrays: Arrays, axis: int, flips: list[jax.Array]) -> tuple[jax.Array, ...]:
     """The skewed weights (up, down) along an axis, or (up − down,) if at most one of the two is positive."""
     table = dict(zip(equation.weights.offsets, equation.weights.values, strict=True))
-    up, down = (table[stencil.unit(layout.grid, layout.axes[axis], step)] for step in (1, -1))
+    up, down = (table[stencil.unit(arrays.grid, arrays.axes[axis], step)] for step in (1, -1))
     flipped = flips[axis - 1] == 1 if axis else False
     # one array instead of two halves the memory traffic, which limits the speed; the sign gives the direction
     if equation.weights.one_way:
@@ -235,10 +228,10 @@ def _towards(equation: PolicyEquation, layout: Layout, axis: int, flips: list[ja
     return _sheared(jnp.where(flipped, down, up), flips), _sheared(jnp.where(flipped, up, down), flips)
 
 
-def _wrapped(planes: jax.Array, layout: Layout) -> jax.Array:
+def _wrapped(planes: jax.Array, arrays: Arrays) -> jax.Array:
     """The planes with margins filled across the seams of periodic axes beyond the first."""
     for axis in range(1, planes.ndim):
-        if layout.closes(axis):
+        if arrays.closes(axis):
             planes = _with_margins(planes, axis)
     return planes
 

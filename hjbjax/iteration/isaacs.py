@@ -27,7 +27,7 @@ def minmax_and_maxmin(hamiltonian: discrete.DiscreteHamiltonian) -> tuple[Field,
 
 def gap_between(hamiltonian: discrete.DiscreteHamiltonian, free: Mask, upper: Field, lower: Field) -> Scalar:
     """The largest min max − max min over the ``free`` nodes."""
-    return hamiltonian.on.grid.largest(jnp.where(free, upper - lower, 0))
+    return hamiltonian.on.grid.layout.largest(jnp.where(free, upper - lower, 0))
 
 
 def weight_of_actions(hamiltonian: discrete.DiscreteHamiltonian, free: Mask, upper: Field, lower: Field) -> Scalar:
@@ -45,7 +45,7 @@ def weight_of_actions(hamiltonian: discrete.DiscreteHamiltonian, free: Mask, upp
     # one pair at a time: all 81 at once would store 81 arrays
     (least, most), _ = jax.lax.scan(compare, (lower, upper), pairs)
     size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # a gap is at least rounding
-    return hamiltonian.on.grid.largest(jnp.where(free, most - least + size, 0))
+    return hamiltonian.on.grid.layout.largest(jnp.where(free, most - least + size, 0))
 
 
 def _representatives(admissible: AdmissibleSet | None) -> Array:

@@ -40,6 +40,7 @@ from hjbjax.iteration.certificates import Certificate, Iterate
 from hjbjax.iteration.evaluation import Evaluation, check_evaluation, evaluate
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import DType, Field, Number, Numbers, Scalar, Verdict
@@ -343,11 +344,11 @@ class Tolerance:
     size: Number
     of_spread: bool
 
-    def at(self, value: Field, grid: Grid) -> Scalar:
+    def at(self, value: Field, layout: Layout) -> Scalar:
         """The bound at W, cost units."""
         if not self.of_spread:
             return jnp.asarray(self.size, value.dtype)
-        return jnp.asarray(self.size * jnp.minimum(1, grid.largest(value) - grid.least(value)), value.dtype)
+        return jnp.asarray(self.size * jnp.minimum(1, layout.largest(value) - layout.least(value)), value.dtype)
 
 
 # the value, its policy, the residual, True if it is small enough, the least residual before, and the number of steps
@@ -381,6 +382,11 @@ class ImplicitStep:
         """The nodes."""
         return self.on.grid
 
+    @property
+    def layout(self) -> Layout:
+        """The layout of the nodes."""
+        return self.grid.layout
+
     def equation(self, value: Field, policy: Greedy) -> PolicyEquation:
         """The linear equation of a policy at ``value``."""
         return bellman.policy_equation(self.on, value, policy, self.obstacles)
@@ -395,7 +401,7 @@ class ImplicitStep:
 
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source|, in cost units."""
-        return self.grid.largest(jnp.abs(equation.source))
+        return self.layout.largest(jnp.abs(equation.source))
 
     def solve(
         self, value: Field, evaluation: Evaluation, tol: Tolerance, max_steps: int
@@ -414,13 +420,13 @@ class ImplicitStep:
             # actions
             policy = self._complete(bellman.greedy(self.on, value, self.obstacles.fixed, incumbent=incumbent))
             equation = self.equation(value, policy)
-            iterate = Iterate(self.grid, value, policy, equation, self.obstacles, counted=True)
+            iterate = Iterate(self.layout, value, policy, equation, self.obstacles, counted=True)
             bound = certificates.error_bound(Certificate.ADDITIVE, iterate, discount=self.on.problem.discount)
             # the tolerance of a short step may be less than the rounding error of V, and could not be reached
-            rounding = ROUNDING * jnp.finfo(value.dtype).eps * self.grid.largest(jnp.abs(value))
+            rounding = ROUNDING * jnp.finfo(value.dtype).eps * self.layout.largest(jnp.abs(value))
             # below this, relative accuracy is lost to underflow, as for a horizon of 1e-300
             rounding = jnp.maximum(rounding, jnp.finfo(value.dtype).tiny / jnp.finfo(value.dtype).eps)
-            enough = (bound.error <= tol.at(value, self.grid)) | (bound.residual <= rounding)
+            enough = (bound.error <= tol.at(value, self.layout)) | (bound.residual <= rounding)
             return policy, bound.residual, enough
 
         def unfinished(carry: Improvement) -> Verdict:

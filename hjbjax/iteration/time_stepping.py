@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
 from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.discretisation.discretisation import Discretisation
@@ -20,9 +21,8 @@ from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman, isaacs
 from hjbjax.iteration.bellman import Obstacles
+from hjbjax.iteration.grid_task import GridTask
 from hjbjax.iteration.time_methods import TABLEAUX, Tableau, TimeMethod, longest_step
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Field, Mask, Nodes, Number, Numbers, Scalar, Verdict
@@ -32,8 +32,8 @@ TRIES = 30  # largest number of attempts to shorten a step; the rates of its fir
 NEAR = 1e-3  # relative to the bound: a disturbance this close to its bound counts as saturated
 
 
-@pytree_dataclass(static=("checks_rates", "checks_noise", "checks_gap", "checks_cut", "bare"))
-class March:
+@pytree_dataclass(static=("checks_rates", "checks_noise", "checks_gap", "checks_cut", "bare", "mesh"))
+class March(GridTask):
     """The constants of a march: the problem on its grid, the method, and the limits of its steps.
 
     Args:
@@ -52,6 +52,7 @@ class March:
       bare: True if only V is stored; everything else is computed where it is used.
       missed: the relative error of integrals over functions of time with these steps, if they were shortened for these
         functions; else zero.
+      mesh: the devices over which the nodes are divided during the march; None: one device.
     """
 
     on: Discretisation
@@ -67,16 +68,7 @@ class March:
     checks_cut: bool = False
     bare: bool = False
     missed: Number = 0.0
-
-    @property
-    def problem(self) -> Problem:
-        """The problem."""
-        return self.on.problem
-
-    @property
-    def grid(self) -> Grid:
-        """The grid."""
-        return self.on.grid
+    mesh: Mesh | None = None
 
     def obstacles_at(self, t: Number) -> Obstacles:
         """Fixed nodes and constraints at the time t."""
@@ -113,7 +105,7 @@ class March:
             found = edges.count_leaving(on, value, u, d, self.obstacles_at(t).acting(value))
             seen = dataclasses.replace(seen, cut=found)
         if self.checks_rates:  # a pass over all rates, skipped if the limit of the step is known
-            fastest = on.grid.largest(jump_rates(on, u, d).total()) + _largest_decay(on)
+            fastest = on.grid.layout.largest(jump_rates(on, u, d).total()) + _largest_decay(on)
             seen = dataclasses.replace(seen, fastest=fastest)
         if self.checks_noise:
             lacking = correlated_noise.lacking(on, on.diffusion(u, d))
@@ -121,7 +113,7 @@ class March:
                 return seen
             # at a fixed node nothing moves, so its noise does not matter
             lacking = jnp.broadcast_to(lacking, on.grid.shape) & ~self.obstacles_at(t).fixed
-            first = on.grid.first(lacking)
+            first = on.grid.layout.first(lacking)
             seen = dataclasses.replace(seen, lacking=first, t=jnp.asarray(t, dtype))
         return seen
 
@@ -193,7 +185,7 @@ def stable(on: Discretisation, tableau: Tableau = TABLEAUX[1], share: Numbers = 
 def _largest_decay(on: Discretisation) -> Scalar:
     """The largest β, over the nodes if it is a function of the state."""
     decay = jnp.asarray(on.decay, on.dtype)
-    return decay if on.problem.killing is None else on.grid.largest(decay)
+    return decay if on.problem.killing is None else on.grid.layout.largest(decay)
 
 
 def terminal(on: Discretisation, start: Nodes | None = None) -> Field:
@@ -264,7 +256,7 @@ def _advance(march: March, front: Front, until: Number) -> Front:
         dt, t, left = _moved(front, until, count)
         value, ok, seen = march.method.step(march, front.value, front.t, t, dt)
     # finite only if all values are: ∞ − ∞ is NaN
-    low, high = march.grid.least(value), march.grid.largest(value)
+    low, high = march.layout.least(value), march.layout.largest(value)
     # later faults override earlier ones
     code = jnp.where(ok, Status.RUNNING, Status.STALLED)
     if march.watched is not None:
@@ -395,4 +387,4 @@ def _saturates(march: March, value: Field, t: Number) -> jax.Array:
     for j, entry in enumerate(greedy_actions(march, value, t)[1]):
         slack = NEAR * (admissible.hi[j] - admissible.lo[j])
         on_bound |= (entry <= admissible.lo[j] + slack) | (entry >= admissible.hi[j] - slack)
-    return march.grid.some(on_bound & march.watched & ~march.obstacles_at(t).fixed)
+    return march.layout.some(on_bound & march.watched & ~march.obstacles_at(t).fixed)

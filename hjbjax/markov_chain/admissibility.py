@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.players import find_players
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete, optimum
-from hjbjax.hamiltonian.players import find_players
 from hjbjax.iteration import bellman
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

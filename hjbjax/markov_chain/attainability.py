@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import cut_cells, edges, stencil
+from hjbjax.discretisation import edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.search import Action
 from hjbjax.markov_chain import tried_actions
 from hjbjax.problem import sets
@@ -78,7 +77,7 @@ def _more_open_jumps(
     """The jumps known to be open, and those opened by a range (first, last) of the actions ``points``."""
     # a jump is open once any action makes it, so order and repetition of actions do not matter
     grid, points = on.grid, jnp.asarray(points, on.dtype)
-    mine = players_of(on).control
+    mine = on.players.control
 
     def tried(actions: Iterable[Action], opened: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         for each in actions:
@@ -133,7 +132,7 @@ def reached(
       least: a rate per unit time; jumps at rates up to it count as rounding.
       clock: the limits; raises ``Stopped`` when they are exceeded.
     """
-    on = on.on_grid(on.grid.walled)  # a path that leaves through an open end may not return
+    on = on.on_grid(stencil.walled(on.grid))  # a path that leaves through an open end may not return
     clock, found, maybe = clock or Clock(), np.zeros(on.grid.shape, bool), np.zeros(on.grid.shape, bool)
     points, few = tried_actions.control_samples(on.problem)
     # A few actions suffice for most problems. Nodes that samples do not reach may be reached by an action that keeps
@@ -170,7 +169,7 @@ def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock)
     as for ``reached``. Takes one step per cell of the longest path, each over all pairs of actions, so use it for
     failing games.
     """
-    found, on = np.ones(on.grid.shape, bool), on.on_grid(on.grid.walled)
+    found, on = np.ones(on.grid.shape, bool), on.on_grid(stencil.walled(on.grid))
     while True:
         # The outer loop removes nodes; the inner loop starts from the target each time and adds nodes. Reaching a set
         # while staying inside another is a greatest fixed point of a least fixed point.
@@ -230,7 +229,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
       inside: search among these nodes, bool (*grid); ``None`` means all nodes outside the target.
       dearest: ignore actions with a higher running cost; ``None`` allows all.
     """
-    start = cut_cells.level(on) > 0 if inside is None else inside
+    start = on.level > 0 if inside is None else inside
     u, d = (
         np.zeros((1, 0)) if admissible is None else np.asarray(sets.samples(admissible, tried_actions.SAMPLES))
         for admissible in (on.problem.controls, on.problem.disturbances)
@@ -246,7 +245,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
 @jax.jit
 def _cheap_somewhere(on: Discretisation, inside: jax.Array, dearest: Scalar, pairs: Array) -> jax.Array:
     """For every pair of actions: True if it, or an action at a kink next to it, costs at most ``dearest`` somewhere."""
-    mine = players_of(on).control
+    mine = on.players.control
     m = len(mine.driven)
 
     def cheap(pair: jax.Array) -> jax.Array:
@@ -262,7 +261,7 @@ def _refuge(
     on: Discretisation, start: jax.Array, dearest: Scalar | None, pairs: Array, count: int | Scalar
 ) -> jax.Array:
     """``refuge`` in the set ``start`` for the first ``count`` rows of ``pairs``, with the inputs of u, then of d."""
-    mine, pairs = players_of(on).control, jnp.asarray(pairs, on.dtype)
+    mine, pairs = on.players.control, jnp.asarray(pairs, on.dtype)
     m = len(mine.driven)
 
     def shrink(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges, stencil
-from hjbjax.discretisation.cut_cells import links
 from hjbjax.discretisation.discretisation import Chain, Discretisation
 from hjbjax.discretisation.posing import without_horizon
 from hjbjax.discretisation.rates import Rates, jump_rates
@@ -23,6 +22,7 @@ from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast
 from hjbjax.problem.settings import own_settings
+from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
 
@@ -179,7 +179,7 @@ def transition_arrays(
       ValueError: the problem is not such a decision problem, rates or costs are not finite, or the chain cannot
         represent the noise.
     """
-    grid.check_indices()
+    checks.check_indices(grid)
     actions = decision_process.action_table(problem)
     held, given = decision_process.target(problem, grid)
     found = (
@@ -187,7 +187,7 @@ def transition_arrays(
         for action in actions
     )
     with own_settings(x64=True):
-        cut = links(Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64)))
+        cut = Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64)).links
         surcharge = decision_process.surcharge(cut, given, grid)
     tables = (
         (jumps.offsets, jumps.values, cost + decision_process.paid(jumps, surcharge), ~leaving)
@@ -199,7 +199,7 @@ def transition_arrays(
 
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
     """The rates under a policy; zero on the target and at nodes without an action."""
-    grid.check_indices()
+    checks.check_indices(grid)
     u, d, active = decision_process.policy_components(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
     # the dtype of the policy determines what counts as rounding: float32 is off by 1e-7 at an end
@@ -218,7 +218,7 @@ def _checked(
     Refuses rates and costs that cannot be exported.
     """
     grid = on.grid
-    grid.refuse_prescribed("chain", "whose payments do not fit into a table of rates and running costs")
+    checks.refuse_prescribed(grid, "chain", "whose payments do not fit into a table of rates and running costs")
     if grid.sides("open"):
         raise ValueError(
             "chain: a grid with open ends has no chain: extrapolating the value beyond them gives negative "

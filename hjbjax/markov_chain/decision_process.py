@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hjbjax.discretisation import cut_cells, stencil
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import stationary_law
@@ -89,7 +89,7 @@ def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np
         paid = np.asarray(on.at_nodes(problem.exit_cost))
         inside = np.zeros(grid.shape, bool)
         if problem.target is not None:
-            inside = np.asarray(cut_cells.level(on) <= 0)
+            inside = np.asarray(on.level <= 0)
     return inside, paid
 
 

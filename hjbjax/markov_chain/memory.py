@@ -16,7 +16,7 @@ import numpy as np
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian.players import find_players, shared
+from hjbjax.discretisation.players import find_players, shared
 from hjbjax.iteration.evaluation import Krylov
 from hjbjax.iteration.methods import Method, PolicyIteration
 from hjbjax.iteration.time_methods import TimeMethod
@@ -25,6 +25,7 @@ from hjbjax.problem.arguments import NO_GRID
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.types import DType
+from hjbjax.tracing import checks
 
 
 def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
@@ -209,7 +210,7 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     if limit is not None:
         arguments.positive(limit, "max_memory", "in bytes")
     free = available() if limit is None else int(limit)
-    grid.check_indices()
+    checks.check_indices(grid)
     # memory is proportional to the number of nodes
     if free is not None and needed > free:
         raise MemoryError(

@@ -4,7 +4,6 @@ All functions are evaluated at all nodes for representative actions. A first pas
 fault. If there is one, a second pass computes counts and first nodes for the error message.
 """
 
-import dataclasses
 import functools
 import itertools
 from collections.abc import Iterable
@@ -14,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import correlated_noise, cut_cells, schemes, stencil
+from hjbjax.discretisation import correlated_noise, schemes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, tabulated
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Mask, Numbers, Scalar, Verdict
@@ -45,7 +44,7 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
     actions = _actions(problem)
     # one compiled program for all schemes whose chain is correct by construction
     chain = Upwind() if scheme.chain.is_proven else scheme.chain
-    on = dataclasses.replace(on, scheme=chain).settled
+    on = on.with_scheme(chain).on_grid(tabulated(on.grid))
     # x64 for 64-bit counts; the functions are still evaluated in ``dtype``
     with own_settings(x64=True):
         # nearly every problem passes and skips the counts and first nodes, which are slow on a CPU
@@ -133,7 +132,7 @@ def _state_fails(on: Discretisation) -> Verdict:
     problem = on.problem
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
-        distance = cut_cells.level(on)
+        distance = on.level
         inside = distance <= 0
         # a target that contains no node, or all nodes
         amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
@@ -152,7 +151,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     inside: Mask | bool = True
     if problem.target is not None:
-        distance = cut_cells.level(on)
+        distance = on.level
         inside = distance <= 0
         found["target"] = _count(~jnp.isfinite(distance), grid)
         found["inside"] = jnp.sum(inside)
@@ -210,7 +209,7 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, j
     if not on.scheme.chain.is_proven:
         links = [stencil.grid_links(on.grid, axis) for axis in range(on.grid.ndim)]
         short = [
-            schemes.falls_short(on.scheme.chain, part[axis], correlated_noise.along_axis(a, on.grid, axis), link)
+            schemes.falls_short(on.scheme.chain, part[axis], stencil.noise_along(a, on.grid, axis), link)
             for part in on.drifts(u, d, x)
             for axis, link in enumerate(links)
         ]

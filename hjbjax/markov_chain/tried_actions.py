@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian.players import Player
+from hjbjax.discretisation.players import Player
 from hjbjax.problem import sets
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box

@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.problem.ends import KINDS, PRESCRIBED
-from hjbjax.problem.parts import FEWEST
+from hjbjax.problem.layouts import FEWEST
 from hjbjax.problem.pytree import is_traced, numbers
 from hjbjax.problem.stretching import Sinh, Stretching
 from hjbjax.problem.types import Array, DType, Key
@@ -304,7 +304,7 @@ def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices:
         if not choice.in_parts:
             raise ValueError(
                 f"{caller}: {choice!r} runs on one device; leave out mesh. A class that reads other nodes only by "
-                "hjbjax.discretisation.stencil, and reduces by grid.largest, may set in_parts = True"
+                "hjbjax.discretisation.stencil, and reduces by grid.layout, may set in_parts = True"
             )
     return mesh if mesh.size > 1 else None
 

@@ -8,7 +8,7 @@ node on the boundary of a target must be inside or outside it in all programs al
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import arguments
-from hjbjax.problem.ends import KINDS, PRESCRIBED, on_face
+from hjbjax.problem.ends import PRESCRIBED, on_face
 from hjbjax.problem.labels import with_unit, words
-from hjbjax.problem.parts import Parts
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
-from hjbjax.problem.types import Array, AtNodes, DType, Mask, Number, Numbers, Scalar, States, Verdict
+from hjbjax.problem.types import Array, DType, Number, Numbers, States
 
 CONTINUED = ("open", "linear", "robin")  # kinds of ends beyond which V is extended
 TABLED = 2**24  # points of an axis with a stored table, 128 MiB; a larger grid must not allocate before it is refused
@@ -66,10 +66,10 @@ class Grid:
     stretch: tuple[Stretching | None, ...] = ()
     edges: Any = "projected"
     units: tuple[str, ...] = ()
-    coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
-    spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``settled``
-    parts: Parts | None = dataclasses.field(init=False, repr=False, default=None)  # over which devices; None: one
-    faces: tuple[Any, ...] = dataclasses.field(init=False, repr=False, default=())  # prescribed ends with their numbers
+    _coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
+    _spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``tabulated``
+    _layout: Layout | None = dataclasses.field(init=False, repr=False, default=None)  # None: all nodes on one device
+    _faces: tuple[Any, ...] = dataclasses.field(init=False, repr=False, default=())  # the numbers of prescribed ends
 
     def __post_init__(self) -> None:
         lo, hi = arguments.corner(self.lo, "lo"), arguments.corner(self.hi, "hi")
@@ -98,11 +98,11 @@ class Grid:
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         tables = (self._by_formula(axis) if count <= TABLED else None for axis, count in enumerate(shape))
-        object.__setattr__(self, "coordinates", tuple(tables))
-        object.__setattr__(self, "faces", tuple(self._faces(axis, given) for axis, given in enumerate(ends)))
-        self.check_spacings(np.float64)  # a solve repeats this in its own dtype, which may be float32
+        object.__setattr__(self, "_coordinates", tuple(tables))
+        object.__setattr__(self, "_faces", tuple(self._prescriptions(axis, given) for axis, given in enumerate(ends)))
+        check_spacings(self, np.float64)  # a solve repeats this in its own dtype, which may be float32
 
-    def _faces(self, axis: int, pair: tuple[Any, Any] | None) -> tuple[Any, Any] | None:
+    def _prescriptions(self, axis: int, pair: tuple[Any, Any] | None) -> tuple[Any, Any] | None:
         """The prescriptions at the two ends of an axis, evaluated at their nodes; None if neither is prescribed."""
         if pair is None or not any(isinstance(end, PRESCRIBED) for end in pair):
             return None
@@ -122,46 +122,9 @@ class Grid:
     def prescribed(self, *kinds: str) -> list[tuple[int, int, Any]]:
         """The prescribed ends of these kinds, or of all kinds: axis, step, and the prescription at the nodes."""
         found = (
-            (axis, step, pair[(step + 1) // 2]) for axis, pair in enumerate(self.faces) if pair for step in (-1, 1)
+            (axis, step, pair[(step + 1) // 2]) for axis, pair in enumerate(self._faces) if pair for step in (-1, 1)
         )
         return [each for each in found if each[2] is not None and (not kinds or each[2].kind in kinds)]
-
-    def refuse_prescribed(self, name: str, why: str) -> None:
-        """Refuse prescribed ends on behalf of a function, with the reason.
-
-        Raises:
-          ValueError: the grid has prescribed ends.
-        """
-        found = sorted({type(end).__name__ for _, _, end in self.prescribed()})
-        if found:
-            raise ValueError(f"{name}: got a grid with {' and '.join(found)} ends, {why}; use edges='projected'")
-
-    def check_spacings(self, dtype: DType) -> None:
-        """Refuse nodes that coincide up to rounding in ``dtype``, because differences of values would be rounding too.
-
-        Raises:
-          ValueError: with the axis and its ends.
-        """
-        for axis, nodes in enumerate(self.coordinates):
-            if isinstance(nodes, np.ndarray):  # not traced, and not too many to be stored
-                arguments.check_nodes(nodes, axis, dtype)
-
-    def check_indices(self) -> None:
-        """Refuse a grid that no solve can use, before anything of the size of the grid is allocated or compiled.
-
-        Raises:
-          MemoryError: more nodes than 32-bit indices can number; the message has the largest possible N.
-          ValueError: prescribed ends without their numbers, as on a grid from a file.
-        """
-        arguments.check_count(self.shape)
-        known = {(axis, step) for axis, step, _ in self.prescribed()}
-        if missing := {side for kind in KINDS for side in self.sides(kind)} - known:
-            axis, step = min(missing)
-            raise ValueError(
-                f"Grid.edges: the {'upper' if step > 0 else 'lower'} end of {self.names[axis]} is prescribed, but its "
-                "numbers are unknown, because files do not store them. Make the Grid again with hjb.Dirichlet(value), "
-                "hjb.Neumann(slope) or hjb.Robin(rate)"
-            )
 
     @property
     def ndim(self) -> int:
@@ -188,73 +151,26 @@ class Grid:
         return [(axis, step) for axis, pair in ends for step, name in zip((-1, 1), pair, strict=True) if name in kinds]
 
     @property
-    def walled(self) -> "Grid":
-        """The grid with the ends of a Markov chain: projected ends instead of open, linear and Robin ends."""
-        pairs = (pair and tuple("projected" if name in CONTINUED else name for name in pair) for pair in self.edges)
-        return altered(self, edges=tuple(pairs))
-
-    def divided(self, parts: Parts) -> "Grid":
-        """The grid of one part, with the shape of its arrays."""
-        return altered(self, shape=parts.shape, parts=parts)
-
-    def settled(self) -> "Grid":
-        """The grid for a program in which it does not change: NumPy computes all numbers derived from its corners."""
-        if any(table is None for table in self.coordinates):
-            return self
-        lo, hi = (tuple(np.asarray(corner)) for corner in (self.lo, self.hi))
-        tables, spacings = [], []
-        for axis, (low, high, table) in enumerate(zip(lo, hi, self.coordinates, strict=True)):
-            tables.append(checked_table(self._by_formula(axis), np.asarray(table), max(abs(low), abs(high))))
-            spacings.append((high - low) / self.intervals(axis))
-        return altered(self, lo=lo, hi=hi, coordinates=tuple(tables), spacings=tuple(spacings))
-
-    @property
-    def whole(self) -> "Grid":
-        """The grid of all parts; the grid itself on one device."""
-        return self if self.parts is None else altered(self, shape=self.parts.whole, parts=None)
-
-    def is_divided(self, axis: int) -> bool:
-        """True if the nodes along an axis are divided over several devices, so that this part holds some of them."""
-        return self.parts is not None and axis in self.parts.axes
-
-    def largest(self, values: AtNodes) -> Scalar:
-        """The largest of node values, on all devices."""
-        return jnp.max(values) if self.parts is None else self.parts.largest(values)
-
-    def least(self, values: AtNodes) -> Scalar:
-        """The smallest of node values, on all devices."""
-        return jnp.min(values) if self.parts is None else -self.parts.largest(-values)
-
-    def total(self, values: AtNodes) -> Scalar:
-        """The sum of node values, on all devices."""
-        return jnp.sum(values) if self.parts is None else self.parts.total(values)
-
-    def some(self, mask: Mask) -> Verdict:
-        """True if a mask holds at some node, on any device."""
-        return jnp.any(mask) if self.parts is None else self.parts.some(mask)
-
-    def first(self, mask: Mask) -> Scalar:
-        """The flat index, over the whole grid, of the first node of a mask, (*grid); −1 for an empty mask."""
-        if self.parts is None:
-            return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
-        return self.parts.first(mask)
+    def layout(self) -> Layout:
+        """The placement of its node arrays: on one device, except inside a program that runs on parts of the grid."""
+        return self._layout or Layout(self.shape)
 
     def intervals(self, axis: int) -> int:
         """The number M of intervals between ``lo`` and ``hi``."""
-        count = self.whole.shape[axis]
+        count = self.layout.whole[axis]
         return count if self.periodic[axis] else count - 1
 
     def spacing(self, axis: int) -> Number:
         """The distance h between neighbours along ``axis``; the mean distance on a stretched axis."""
-        return self.spacings[axis] if self.spacings else (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
+        return self._spacings[axis] if self._spacings else (self.hi[axis] - self.lo[axis]) / self.intervals(axis)
 
     def axis(self, axis: int, dtype: DType | None = None) -> Array:
         """The coordinates of the nodes along one axis, shape (N,); the same numbers in every program."""
-        if self.parts is not None:
-            return self.parts.own(self.whole.axis(axis, dtype), axis)
-        if self.spacings is not None:
-            return jnp.asarray(self.coordinates[axis], dtype or jnp.result_type(float))
-        computed, table = self._by_formula(axis), self.coordinates[axis]
+        if self._layout is not None:
+            return self._layout.own(undivided(self).axis(axis, dtype), axis)
+        if self._spacings is not None:
+            return jnp.asarray(self._coordinates[axis], dtype or jnp.result_type(float))
+        computed, table = self._by_formula(axis), self._coordinates[axis]
         table = computed if table is None else table
         # NumPy if nothing is traced, also inside ``jit``, where the table then is a constant
         if is_traced(computed, table):
@@ -389,6 +305,52 @@ class Grid:
         fraction = (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
         fraction = jnp.nan_to_num(fraction)  # no clip here: it would halve the derivative at a node
         return cell, jnp.where((fraction >= 0) & (fraction <= 1), fraction, jnp.clip(fraction, 0, 1)), inside
+
+
+def check_spacings(grid: Grid, dtype: DType) -> None:
+    """Refuse nodes that coincide up to rounding in ``dtype``, because differences of values would be rounding too.
+
+    Raises:
+      ValueError: with the axis and its ends.
+    """
+    for axis, nodes in enumerate(grid._coordinates):
+        if isinstance(nodes, np.ndarray):  # not traced, and not too many to be stored
+            arguments.check_nodes(nodes, axis, dtype)
+
+
+def tabulated(grid: Grid) -> Grid:
+    """The grid with spacings and coordinates that NumPy computed, as constants for programs on one grid."""
+    if any(table is None for table in grid._coordinates):
+        return grid
+    lo, hi = (tuple(np.asarray(corner)) for corner in (grid.lo, grid.hi))
+    tables, spacings = [], []
+    for axis, (low, high, table) in enumerate(zip(lo, hi, grid._coordinates, strict=True)):
+        tables.append(checked_table(grid._by_formula(axis), np.asarray(table), max(abs(low), abs(high))))
+        spacings.append((high - low) / grid.intervals(axis))
+    return altered(grid, lo=lo, hi=hi, _coordinates=tuple(tables), _spacings=tuple(spacings))
+
+
+def with_prescriptions_of(grid: Grid, other: Grid, change: Callable[[Any], Any]) -> Grid:
+    """The grid with the prescribed ends of another grid, whose numbers at the nodes are changed by a function."""
+    return altered(grid, _faces=jax.tree.map(change, other._faces))
+
+
+def with_prescriptions(grid: Grid, change: Callable[[Any], Any]) -> Grid:
+    """The grid with every prescribed end replaced by a function of it."""
+    found = [
+        None if pair is None else tuple(None if end is None else change(end) for end in pair) for pair in grid._faces
+    ]
+    return altered(grid, _faces=tuple(found))
+
+
+def placed(grid: Grid, layout: Layout) -> Grid:
+    """The grid of the nodes that a layout places on this device, with the shape of its arrays."""
+    return altered(grid, shape=layout.shape, _layout=layout)
+
+
+def undivided(grid: Grid) -> Grid:
+    """The grid of the nodes of all devices."""
+    return altered(grid, shape=grid.layout.whole, _layout=None)
 
 
 def _states(x: Numbers) -> jax.Array:

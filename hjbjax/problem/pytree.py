@@ -344,11 +344,23 @@ def as_partial(function: Callable | None, name: str = "function") -> jax.tree_ut
 
 
 def altered(tree: T, **fields: Any) -> T:
-    """A copy with changed fields and without the checks of ``dataclasses.replace``, which would fail on tracers."""
+    """A copy with changed fields and without the checks of ``dataclasses.replace``, which would fail on tracers.
+
+    Cached properties are computed again, because they may depend on the changed fields.
+    """
     result = copy.copy(tree)  # shallow, and without __init__
+    owner: Any = type(tree)
+    for name in _cached_properties(owner):
+        vars(result).pop(name, None)
     for name, value in fields.items():
         object.__setattr__(result, name, value)
     return result
+
+
+@functools.cache
+def _cached_properties(cls: type) -> tuple[str, ...]:
+    """The names of the cached properties of a class."""
+    return tuple(name for name, member in vars(cls).items() if isinstance(member, functools.cached_property))
 
 
 def as_jax(tree: T) -> T:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, with_prescriptions
 from hjbjax.problem.labels import REWARD
 from hjbjax.problem.problem import PAYMENTS, Problem
 from hjbjax.problem.pytree import altered
@@ -71,16 +71,12 @@ def _negative_number(number: Any) -> Any:
 
 def negative_ends(grid: Grid) -> Grid:
     """The grid with minus the values and slopes that are prescribed at its ends; a growth rate has no sign."""
-    if not any(grid.faces):
-        return grid
 
     def changed(end: Any) -> Any:
-        if end is None:
-            return None
         names = [each.name for each in dataclasses.fields(end) if each.name != "rate"]
         return altered(end, **{name: 0 - getattr(end, name) for name in names})
 
-    return altered(grid, faces=tuple(pair and (changed(pair[0]), changed(pair[1])) for pair in grid.faces))
+    return with_prescriptions(grid, changed) if grid.prescribed() else grid
 
 
 def refuse_rewards(problem: Problem | None, name: str, why: str) -> None:

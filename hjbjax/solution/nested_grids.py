@@ -4,11 +4,9 @@ import dataclasses
 import math
 from typing import Any
 
-import jax
 import numpy as np
 
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import altered
+from hjbjax.problem.grid import Grid, with_prescriptions_of
 
 FEWEST = 12  # least number of intervals per axis of a coarser grid
 FEWEST_TELLING = 6  # least number of intervals on a coarser grid that estimates the error of the finer one
@@ -114,7 +112,7 @@ def with_faces_of(grid: Grid, coarse: Grid) -> Grid:
                 values = np.take(values, places(grid, coarse, axis), axis=axis)
         return values
 
-    return altered(coarse, faces=jax.tree.map(at_nodes, grid.faces)) if grid.faces else coarse
+    return with_prescriptions_of(coarse, grid, at_nodes)
 
 
 def at_nearest_nodes(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:

@@ -57,7 +57,7 @@ def _may_rest(task: Task) -> bool:
     """True if nothing else makes a policy arrive: no discount, no positive running cost, no noise."""
     problem = task.problem
     undiscounted = np.all(np.asarray(problem.discount) == 0)
-    one_player = not problem.is_game and problem.noise is None and task.on.mesh is None
+    one_player = not problem.is_game and problem.noise is None and task.mesh is None
     if not (undiscounted and one_player) or problem.target is None or problem.exit_cost is None:
         return False
     if task.least_cost is not None:  # stored only where it is positive: resting then costs indefinitely

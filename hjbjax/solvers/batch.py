@@ -34,8 +34,8 @@ from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem import arguments
 from hjbjax.problem.arguments import as_mesh, shown
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Lanes, spans_processes
+from hjbjax.problem.grid import Grid, check_spacings
+from hjbjax.problem.layouts import Lanes, spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Nodes
@@ -125,9 +125,9 @@ def solve_batch(
             raise TypeError(f"solve_batch: lane {number} is {shown(lane)}; wanted only problems")
         check_arguments(lane, grid, method, scheme, tol)
     check_slopes(scheme, "solve_batch: scheme")
-    grid.check_indices()
+    checks.check_indices(grid)
     kind = arguments.as_dtype(dtype)
-    grid.check_spacings(kind)
+    check_spacings(grid, kind)
     solutions: list[Any] = [None] * len(lanes)
     over = Lanes(None if mesh is None else _over_lanes(mesh, lanes, grid, method, checkpoint))
     clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(over.mesh))
@@ -288,7 +288,7 @@ def _solve_together(
                 node_checks.check_values(on, clock)
                 admissibility.check_constrained_ends(on.problem, on.grid, on.dtype)
                 if choices.scheme:
-                    on = asked[name] = dataclasses.replace(on, scheme=choose_scheme(on, method))
+                    on = asked[name] = on.with_scheme(choose_scheme(on, method))
                 prepared[name] = prepare_on_host(on.chain, method=method, tol=tol, clock=clock)
                 followed = replace_chain(on, prepared[name][2], tol, None, clock) if choices.both else None
         except Stopped as stop:

@@ -150,8 +150,7 @@ def other_ends(problem: Problem, grid: Grid) -> tuple:
 
 def _coarse_task(task: Task) -> Task | None:
     """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
-    on = dataclasses.replace(task.on.chain, mesh=None)
-    level = dataclasses.replace(task, on=on)
+    level = dataclasses.replace(task, on=task.on.chain, mesh=None)
     wanted = int(np.clip(task.grid.size // SHARE, FEWEST, MOST))
     while level.grid.size > wanted:
         coarse = nested_grids.coarser(level.grid, INTERVALS)
@@ -165,7 +164,7 @@ def _coarse_task(task: Task) -> Task | None:
 def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     """|W − V| on the grid ``fine``, from V on a coarse one."""
     grid = altered(level.grid, edges=other_ends(level.problem, level.grid))
-    others = dataclasses.replace(level.on, grid=grid, cut=None)
+    others = level.on.on_grid(grid)
     restricted, policy = _defect(level, jnp.asarray(before, level.tol.dtype))
     start, defect = jax.device_get((restricted, policy.defect))
     obstacles = _fixed_next_to_lost(level)

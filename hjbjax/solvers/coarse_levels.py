@@ -6,16 +6,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax.discretisation import cut_cells
-from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Nodes
 from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solvers.order import at_order, sharpened, staged
-from hjbjax.solvers.setup import assumptions_of, prepared
+from hjbjax.solvers.setup import assumptions_of, prepared, stores_links
 from hjbjax.solvers.stationary_run import iterate
 from hjbjax.solvers.vanishing_discounts import warm
 
@@ -102,13 +102,13 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
         bare: Any = dataclasses.replace(task, on=None)  # type: ignore[arg-type]
         known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
         on = task.on.on_grid(coarse)
-        made = dataclasses.replace(known, on=_kept(on) if cut_cells.keeps(on) else on)
+        made = dataclasses.replace(known, on=_with_links(on) if stores_links(on) else on)
     elif task.has_lost:  # whether nodes in between reach the target is not known
         return None
     else:
         level = task.on.chain.on_grid(coarse)
-        made = prepared(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level))
-        on = dataclasses.replace(task.on.on_grid(coarse), cut=made.on.cut)
+        made = prepared(level, method=task.method, tol=task.tol, assumptions=assumptions_of(level), mesh=task.mesh)
+        on = altered(made.on, problem=task.problem, grid=coarse, scheme=task.scheme)  # with the links of the chain
         made = dataclasses.replace(made, on=on, certificate=task.certificate)
         if task.first_order is not None:
             made = at_order(made, first=bool(np.asarray(task.first_order)))
@@ -118,4 +118,4 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
     return None if held and not kept else made
 
 
-_kept = jax.jit(cut_cells.kept)
+_with_links = jax.jit(Discretisation.with_links)

@@ -17,15 +17,14 @@ from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.posing import with_horizon
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import check_choice
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem import arguments
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import spans_processes
+from hjbjax.problem.grid import Grid, check_spacings
+from hjbjax.problem.layouts import spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.sets import Box
@@ -139,7 +138,7 @@ def march(
     if not isinstance(policy, bool):
         raise TypeError(f"march: policy is {policy!r}; wanted True or False")
     _check_inner(problem, inner)
-    grid.check_indices()
+    checks.check_indices(grid)
     horizon, kept = _times(horizon, times)
     traced = is_traced(problem, grid, method, start)
     if mesh is not None:
@@ -153,7 +152,7 @@ def march(
     if np.any(np.diff(kept.astype(kind)) <= 0):
         raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; remove one")
     check_node_values(start, grid, "march: start")
-    grid.check_spacings(kind)
+    check_spacings(grid, kind)
     clock = Clock(seconds=time_limit, progress=progress, together=spans_processes(mesh))
     opened = checkpoints.open_checkpoint(
         checkpoint, [problem], grid, resume=resume, caller="march", together=clock.together, horizon=horizon,
@@ -169,13 +168,15 @@ def march(
         clock.journal = file and file.journal()
         # within a second: errors visible at a single state, and a grid that does not fit
         check_on_one_state(problem, grid, scheme)
-        on = Discretisation(problem, grid, scheme, kind, mesh=mesh)
+        on = Discretisation(problem, grid, scheme, kind)
         needed = memory.fitting(memory.of_march(on, len(kept), method, policy=policy), grid, max_memory)
         with host_loop.with_solution(
             clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
         ):
             try:
-                task, solution = _on_host(on, horizon, kept, start, method, step, inner, clock, policy=policy)
+                task, solution = _on_host(
+                    on, horizon, kept, start, method, step, inner, clock, policy=policy, mesh=mesh
+                )
                 if solution.status is Status.CONVERGED:
                     marched = Marched(task, method, start, int(solution.steps))
                     solution = with_march_errors(solution, marched, clock)
@@ -233,6 +234,7 @@ def _on_host(
     clock: Clock,
     *,
     policy: bool,
+    mesh: Mesh | None = None,
 ) -> tuple[March, Solution]:
     """The task of a march, and its solution as far as the clock allows.
 
@@ -240,7 +242,7 @@ def _on_host(
       Stopped: the clock stopped the march before the first step.
     """
     _check_nodes(on, horizon, clock)
-    task = _prepare(on, horizon, method, step, inner, policy=policy)
+    task = _prepare(on, horizon, method, step, inner, policy=policy, mesh=mesh)
     slices, front, code = march_run.drive_march(task, horizon, kept, start, clock)
     return task, march_run.assemble(task, on.grid, slices, front, code)
 
@@ -308,14 +310,21 @@ def _without_moving_target(problem: Problem) -> Problem:
 
 
 def _prepare(
-    on: Discretisation, horizon: float, method: TimeMethod, step: float | None, inner: float | None, *, policy: bool
+    on: Discretisation,
+    horizon: float,
+    method: TimeMethod,
+    step: float | None,
+    inner: float | None,
+    *,
+    policy: bool,
+    mesh: Mesh | None = None,
 ) -> March:
     """The task of a march, all arrays in its dtype, with a given step checked against the limit."""
     on, dtype = cast(on, on.dtype), on.dtype
     problem, grid = on.problem, on.grid
     moving = problem.time_dependent
     limit: Scalar = jnp.asarray(jnp.inf, dtype)
-    method = method.filled(on, march_evaluation(problem, grid, divided=on.mesh is not None))
+    method = method.filled(on, march_evaluation(problem, grid, divided=mesh is not None))
     if method.limited:
         # For functions of time 1/(max Q + β) depends on time. A given step is checked against the least of many values;
         # otherwise the step is computed before every step.
@@ -343,15 +352,15 @@ def _prepare(
         on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(longest, dtype),
         jnp.asarray(horizon, dtype), _blow_up_nodes(on, inner),
         checks_rates=looks[0], checks_noise=looks[1], checks_gap=looks[2] and policy,
-        checks_cut=_checks_cut(on) and policy, bare=not policy,
-        missed=jnp.asarray(left, dtype),
+        checks_cut=_checks_cut(on) and policy and mesh is None, bare=not policy,
+        missed=jnp.asarray(left, dtype), mesh=mesh,
     )  # fmt: skip
 
 
 def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool, bool]:
     """Three flags: steps must check the rates, correlated noise under their actions, and Isaacs' gap."""
     problem = on.problem
-    players, moving = players_of(on), problem.time_dependent
+    players, moving = on.players, problem.time_dependent
     # Q is known in advance if it is largest at an end of the sets; otherwise only under the chosen actions
     sampled = not (players.control.fastest_at_ends and players.disturbance.fastest_at_ends)
     # a stage after the first is at a later time, at which Q may exceed the limit of the first
@@ -362,8 +371,8 @@ def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool, bool]:
 
 
 def _checks_cut(on: Discretisation) -> bool:
-    """True if time-dependent drift may leave between two kept times; not checked if nodes are divided."""
-    return on.problem.time_dependent and on.mesh is None and bool(on.grid.sides("projected"))
+    """True if time-dependent drift may leave between two kept times."""
+    return on.problem.time_dependent and bool(on.grid.sides("projected"))
 
 
 def _check_step(step: float | None, limit: float) -> None:

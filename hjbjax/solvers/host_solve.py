@@ -7,6 +7,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration.methods import Method
@@ -47,14 +48,20 @@ class Choices:
 
 
 def solve_on_host(
-    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, choices: Choices
+    on: Discretisation,
+    method: Method,
+    tol: float,
+    guess: Nodes | None,
+    clock: Clock,
+    choices: Choices,
+    mesh: Mesh | None = None,
 ) -> Solution:
     """The solution, with an estimate of the grid error if the caller left the scheme open.
 
     Arguments as for ``settled_on_host``.
     """
     try:
-        settled, about = settled_on_host(on, method, tol, guess, clock, choices)
+        settled, about = settled_on_host(on, method, tol, guess, clock, choices, mesh)
     except Stopped as stop:
         return solution_at_start(stop.reached[0], stop.reached[1], stop.status)
     if isinstance(settled, Followed):
@@ -70,7 +77,13 @@ def solve_on_host(
 
 
 def settled_on_host(
-    on: Discretisation, method: Method, tol: float, guess: Nodes | None, clock: Clock, choices: Choices
+    on: Discretisation,
+    method: Method,
+    tol: float,
+    guess: Nodes | None,
+    clock: Clock,
+    choices: Choices,
+    mesh: Mesh | None = None,
 ) -> tuple[Settled | Followed, dict[str, Any]]:
     """The end of the iteration, and statistics about it.
 
@@ -81,6 +94,7 @@ def settled_on_host(
       guess: initial node values, or None.
       clock: the limits.
       choices: the choices that the caller left open.
+      mesh: the devices over which the nodes are divided; None: one device.
 
     Raises:
       Stopped: the clock stopped the solve before the first step; ``reached`` is the discretisation and the start.
@@ -93,10 +107,11 @@ def settled_on_host(
         admissibility.check_constrained_ends(problem, grid, on.dtype)
         sharpen = choices.scheme
         if sharpen:
-            on = dataclasses.replace(on, scheme=choose_scheme(on, method))
+            on = on.with_scheme(choose_scheme(on, method))
             sharpen = on.scheme.subcell  # value iteration and tubes must start from the chain, also on a coarser grid
-        task, assumptions, reach = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock)
-        followed = semi_lagrangian.replace_chain(on, reach, tol, start, clock) if choices.both else None
+        task, assumptions, reach = prepare_on_host(on.chain, method=method.inner, tol=tol, clock=clock, mesh=mesh)
+        may_follow = choices.both and mesh is None  # arcs read nodes far away
+        followed = semi_lagrangian.replace_chain(on, reach, tol, start, clock) if may_follow else None
     except Stopped as stop:
         raise Stopped(stop.status, (on, np.zeros(grid.shape) if start is None else np.array(start))) from None
     if followed is not None:

@@ -152,7 +152,7 @@ def _held(task: March, times: np.ndarray) -> tuple[np.ndarray, bool]:
     problem, grid = task.problem, task.grid
     if problem.target is None and not grid.prescribed("dirichlet"):
         return np.zeros((1, *grid.shape), bool), False
-    on = dataclasses.replace(task.on, mesh=None)
+    on = task.on
     moments = times if problem.time_dependent else times[:1]
     found = [jax.device_get(_fixed(on.at(jnp.asarray(t, on.dtype)))) for t in moments]
     return np.stack([fixed for fixed, _ in found]), any(grid_error.is_a_point(ended) for _, ended in found)
@@ -170,7 +170,7 @@ def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
     elif marched.steps <= 1 and not task.method.limited:
         reason = ONE_STEP
     else:
-        on = dataclasses.replace(task.on.on_grid(coarse), mesh=None)
+        on = task.on.on_grid(coarse)
         kept = _every_second(times, float(task.horizon), marched.steps)
         return _Coarse(on, _longer(marched, times[kept]), kept)
     if others == grid.edges:
@@ -178,7 +178,7 @@ def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
     smaller = box_error.coarse_for_marches(grid)
     if smaller is None:
         return _Coarse(None, 1.0, everything, reason)
-    return _Coarse(dataclasses.replace(task.on.chain.on_grid(smaller), mesh=None), 1.0, everything, reason)
+    return _Coarse(task.on.chain.on_grid(smaller), 1.0, everything, reason)
 
 
 def _every_second(times: np.ndarray, horizon: float, steps: int) -> np.ndarray:
@@ -211,7 +211,7 @@ def _again(
     again = dataclasses.replace(
         task, on=on, method=method, obstacles=None, watched=None, limit=_limit(task, on) if longer else task.limit,
         step=_steps(task, coarse.longer) if longer else task.step, checks_rates=longer and task.checks_rates,
-        checks_noise=False, checks_gap=False, checks_cut=False, bare=True,
+        checks_noise=False, checks_gap=False, checks_cut=False, bare=True, mesh=None,
     )  # fmt: skip
     kept = np.asarray(solution.times, float)[coarse.kept]
     slices, _, code = march_run.drive_march(again, float(task.horizon), kept, begin, clock.beside())

@@ -1,6 +1,5 @@
 """A march in chunks of steps from one kept time to the next, and its solution."""
 
-import functools
 from typing import Any, TypeAlias
 
 import jax
@@ -8,14 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges
-from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.hamiltonian import discrete
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
 from hjbjax.markov_chain import node_checks
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import Parts, spans_processes
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.checkpoints import check_alike
@@ -37,20 +33,36 @@ ADVICE = {
     Status.STALLED: "The policy iteration of an implicit step did not converge; use a shorter step.",
 }
 
-# not donated: a chunk that ends in NaN is repeated from the front before it
-_run = WideJit(time_stepping.run)
 _terminal = jax.jit(time_stepping.terminal)
 
 # the players' actions, the nodes on the target, and the nodes at which actions matter
 Feedback: TypeAlias = tuple[tuple[tuple[Field, ...], tuple[Field, ...]], jax.Array | bool, jax.Array]
 
 
+# not donated: a chunk that ends in NaN is repeated from the front before it
+@WideJit
+def _run(march: March, front: Front, until: Number, most: Number) -> Front:
+    """``time_stepping.run`` on all devices, each with its own nodes."""
+
+    def here(march: March, front: Front, until: Number, most: Number) -> Front:
+        return time_stepping.run(march.on_part(layout), front, until, most)
+
+    layout, front_over = march.division, _front_over_nodes(front)
+    over = march.over_nodes(layout.entries), front_over, False, False
+    return layout.mapped(here, over, front_over)(march, front, until, most)
+
+
 @jax.jit
 def _greedy(march: March, value: Field, t: Number) -> Feedback:
     """The players' actions at the time t, the nodes on the target, and the nodes at which actions matter."""
-    u, d = time_stepping.greedy_actions(march, value, t)
-    obstacles = march.obstacles_at(t)
-    return (u, d), obstacles.ended, obstacles.acting(value)
+
+    def here(march: March, value: Field, t: Number) -> Feedback:
+        part = march.on_part(layout)
+        obstacles = part.obstacles_at(t)
+        return time_stepping.greedy_actions(part, value, t), obstacles.ended, obstacles.acting(value)
+
+    layout = march.division
+    return layout.mapped(here, (march.over_nodes(layout.entries), True, False), True)(march, value, t)
 
 
 @jax.jit
@@ -60,7 +72,7 @@ def _gap_at(task: March, value: Field, t: Number) -> tuple[Scalar, Scalar]:
     There is no gap if the players drive separate components, or if each is upwinded separately.
     """
     # then H is a sum over the players, and min max equals max min at every node
-    if players_of(task.on).decoupled:
+    if task.on.players.decoupled:
         return jnp.zeros(()), jnp.ones(())
     hamiltonian = discrete.around(task.on.at(t), value)
     return isaacs_gap(hamiltonian, ~task.obstacles_at(t).fixed)
@@ -76,27 +88,6 @@ def _isaacs_gap(task: March, front: Front, code: Status) -> float | None:
         gap, matter = at_end, matter_there
     warn_of_gap(gap, matter, task.problem.isaacs)
     return gap
-
-
-@functools.partial(WideJit, static_argnames="parts")
-def _run_in_parts(march: March, front: Front, until: Number, most: Number, parts: Parts) -> Front:
-    """``time_stepping.run`` on all devices of a mesh, each with its own nodes."""
-
-    def here(march: March, front: Front, until: Number, most: Number) -> Front:
-        return time_stepping.run(on_part(march, parts), front, until, most)
-
-    over = over_nodes(march, parts.entries), _front_over_nodes(front), False, False
-    return parts.mapped(here, over, over[1])(march, front, until, most)
-
-
-@functools.partial(jax.jit, static_argnames="parts")
-def _greedy_in_parts(march: March, value: Field, t: Number, parts: Parts) -> Feedback:
-    """``_greedy`` on all devices of a mesh."""
-
-    def here(march: March, value: Field, t: Number) -> Feedback:
-        return _greedy(on_part(march, parts), value, t)
-
-    return parts.mapped(here, (over_nodes(march, parts.entries), True, False), True)(march, value, t)
 
 
 def _front_over_nodes(front: Front) -> Front:
@@ -172,10 +163,10 @@ def drive_march(
 ) -> tuple[Slices, Front, Status]:
     """The slices at the kept times, the last front and its status; ends at a code, the time limit, or Ctrl-C."""
     start = None if start is None else jnp.asarray(start, np.dtype(task.horizon.dtype))
-    value, parts = _terminal(task.on.at(task.horizon), start), task.on.parts
+    value = _terminal(task.on.at(task.horizon), start)
     front = time_stepping.begin(task, value, horizon - kept[-1])
     finite = bool(jnp.all(jnp.isfinite(front.value)))
-    run = MarchRun(task, front, kept) if parts is None else MarchInParts(task, front, kept, parts)
+    run = MarchRun(task, front, kept)
     del front, value  # free the value at the horizon, which is not needed after the first steps
     status = host_loop.drive(run, clock) if finite else Status.NONFINITE
     slices, front = run.slices, run.gathered()
@@ -190,10 +181,12 @@ class MarchRun:
 
     limit, longest = np.inf, 10**9  # of steps: unlimited
     passing = False
-    _run, _greedy = staticmethod(_run), staticmethod(_greedy)
 
     def __init__(self, task: March, front: Front, kept: np.ndarray):
-        self.task, self.front, self.slices = task, front, Slices(task, kept)
+        self.task, self.slices = task, Slices(task, kept)
+        self.layout, self._over = task.division, _front_over_nodes(front)
+        over = task.over_nodes(task.grid.shape), self._over
+        self._divided, self.front = self.layout.spread((task, front), over)
         self.nodes, self.name = task.grid.size, f"{' x '.join(map(str, task.grid.shape))} nodes"
         form = "{desc}: {percentage:3.0f}% |{bar}| t {n:.3g} of {total:.3g}{postfix} [{elapsed}<{remaining}]"
         self.bar = {"desc": "march", "total": float(task.horizon), "bar_format": form}
@@ -218,7 +211,7 @@ class MarchRun:
 
     def compile(self) -> None:
         """Call the program with zero steps."""
-        jax.block_until_ready(self._run(self.task, self.front, jnp.zeros_like(self.until), 0))
+        jax.block_until_ready(_run(self._divided, self.front, jnp.zeros_like(self.until), 0))
 
     def first_chunk(self, clock: Clock) -> int:
         """One step, since none has been timed."""
@@ -229,11 +222,11 @@ class MarchRun:
 
         A chunk that ends in values that are not finite is undone back to the last finite step.
         """
-        after = jax.block_until_ready(self._run(self.task, self.front, self.until, count))
+        after = jax.block_until_ready(_run(self._divided, self.front, self.until, count))
         status = Status(int(after.code))
         if status is Status.NONFINITE:
             # the steps are identical, so the chunk ends just before the bad one
-            after = self._run(self.task, self.front, self.until, int(after.steps) - self.steps - 1)
+            after = _run(self._divided, self.front, self.until, int(after.steps) - self.steps - 1)
         self.front = after
         return status
 
@@ -260,19 +253,22 @@ class MarchRun:
 
     def _clock(self, left: float) -> Any:
         """The clock of a front at the beginning of an interval."""
-        return jnp.asarray([left, 0], self.slices.value.dtype)
+        return self.layout.spread(jnp.asarray([left, 0], self.slices.value.dtype), False)
 
     def gathered(self) -> Front:
         """The front, with values at all nodes."""
-        return self.front
+        return self.layout.gathered(self.front, self._over)
 
     def store(self, *, feedback: bool = True) -> None:
         """Store the value at the front, and its feedback, as the next slice."""
-        # one program for all kept times: the time is an argument
-        asked = feedback and not self.task.bare
-        answer = jax.device_get(self._greedy(self.task, self.front.value, self.front.t)) if asked else None
-        self.slices.keep(self.task, self.front.value, self.time, answer)
-        self._keep_cut(self.front)
+        front, answer = self.gathered(), None
+        if feedback and not self.task.bare:
+            # one program for all kept times: the time is an argument
+            answer = _greedy(self._divided, self.front.value, self.front.t)
+            answer = jax.device_get(self.layout.gathered(answer, jax.tree.map(lambda _: True, answer)))
+        self.slices.keep(self.task, front.value, self.time, answer)
+        if self.task.checks_cut:
+            self._keep_cut(self.front)
 
     def _keep_cut(self, front: Front) -> None:
         """Record the counts of cut-off drift since the previous kept time, if larger, and reset them."""
@@ -300,7 +296,7 @@ class MarchRun:
             )
         Status(int(front.code))
         self.slices.restore(arrays[:count])
-        self.front = front
+        self.front = self.layout.spread(front, self._over)
 
     def show(self, bar: Any) -> None:
         """Advance the progress bar, which shows the problem's own time."""
@@ -308,48 +304,14 @@ class MarchRun:
         bar.set_postfix_str(f"{self.steps} steps", refresh=False)
 
     def keep(self, error: Exception) -> None:
-        """Attach the solution so far to an exception."""
+        """Attach the solution so far to an exception; data in other processes is inaccessible."""
+        if not self.layout.is_local:
+            return
         if self.slices.misses(self.time):
             # without a feedback, whose program would call the failed function again
             self.store(feedback=False)
         solution = assemble(self.task, self.task.grid, self.slices, self.gathered(), Status.INTERRUPTED)
         error.solution = solution  # type: ignore[attr-defined]
-
-
-class MarchInParts(MarchRun):
-    """A march whose nodes are divided among several devices."""
-
-    def __init__(self, task: March, front: Front, kept: np.ndarray, parts: Parts):
-        super().__init__(task, front, kept)
-        self.parts, self._over = parts, _front_over_nodes(front)
-        self._divided, self.front = parts.spread((task, front), (over_nodes(task, task.grid.shape), self._over))
-        self._run = lambda _, *front_and_limits: _run_in_parts(self._divided, *front_and_limits, parts=parts)
-
-    def _clock(self, left: float) -> Any:
-        """The clock of a front at the beginning of an interval, on every device."""
-        return self.parts.spread(np.asarray(super()._clock(left)), False)
-
-    def gathered(self) -> Front:
-        """The front, with the values of all parts."""
-        return self.parts.gathered(self.front, self._over)
-
-    def store(self, *, feedback: bool = True) -> None:
-        """Store the value at the front, and its feedback, as the next slice."""
-        front, answer = self.gathered(), None
-        if feedback and not self.task.bare:
-            answer = _greedy_in_parts(self._divided, self.front.value, self.front.t, self.parts)
-            answer = self.parts.gathered(answer, jax.tree.map(lambda _: True, answer))
-        self.slices.keep(self.task, front.value, self.time, answer)
-
-    def keep(self, error: Exception) -> None:
-        """Attach the solution so far to an exception; data in other processes is inaccessible."""
-        if not spans_processes(self.parts.mesh):
-            super().keep(error)
-
-    def restore(self, arrays: list[np.ndarray]) -> None:
-        """Continue from a saved front, on any number of devices."""
-        super().restore(arrays)
-        self.front = self.parts.spread(self.front, self._over)
 
 
 def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status) -> Solution:

@@ -19,7 +19,7 @@ def staged(task: Task, scheme: Scheme) -> Task:
     certified = task.certificate in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE)
     if scheme.monotone or not (fits and certified):
         return task
-    return at_order(dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme)), first=True)
+    return at_order(dataclasses.replace(task, on=task.on.with_scheme(scheme)), first=True)
 
 
 def at_order(task: Task, *, first: bool) -> Task:
@@ -49,6 +49,6 @@ def sharpened(task: Task, *, first: bool = False) -> Task:
 def raised(task: Task, assumptions: Assumptions, scheme: Scheme) -> tuple[Task, Assumptions]:
     """The task and the assumptions of a high-order scheme, which has no certificate, from those of its chain."""
     # defect correction: the matrix of the chain, the residual of the better slopes
-    on = dataclasses.replace(task.on, scheme=scheme)
+    on = task.on.with_scheme(scheme)
     task = dataclasses.replace(task, certificate=Certificate.RESIDUAL, on=on, first_order=None)
     return sharpened(task), dataclasses.replace(assumptions, certificate=Certificate.RESIDUAL)

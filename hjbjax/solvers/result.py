@@ -11,7 +11,6 @@ import numpy as np
 from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete, exact, optimum
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate, ErrorBound
 from hjbjax.iteration.fixed_point import State, Task
@@ -216,7 +215,7 @@ def _enclosure(task: Task, state: State, assumptions: Assumptions) -> Any:
     if kind not in BOUNDING or not assumptions.exact:
         return None
     traced = is_traced(state)  # before a solve, the host has checked that costs are convex where they must be
-    if any(each.programmed for each in players_of(task.on).both) or (traced and exact.needs_convexity(task.on)):
+    if any(each.programmed for each in task.on.players.both) or (traced and exact.needs_convexity(task.on)):
         bound = _widened(task, state.value, bound, kind)
         bound = bound if traced else jax.device_get(bound)
     return certificates.enclosure(kind, bound, discount)
@@ -267,7 +266,7 @@ def _lacking(task: Task, controls: tuple, disturbances: tuple) -> jax.Array:
 
 def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
     """Refuse noise of the found action that has no chain, although the samples checked before had one."""
-    if not callable(task.problem.noise) or not players_of(task.on).steers_noise:
+    if not callable(task.problem.noise) or not task.on.players.steers_noise:
         return
     policy = state.policy
     # the checks before a solve use samples of the actions; the exact minimum may lie between them

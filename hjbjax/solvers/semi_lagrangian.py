@@ -174,11 +174,11 @@ def replace_chain(
     Returns:
       The end of the iteration. None if the chain is not carried past the target, or the arcs are no improvement.
     """
-    if reach is None or on.mesh is not None or np.asarray(on.problem.discount) > 0 or not is_carried_past(reach):
+    if reach is None or np.asarray(on.problem.discount) > 0 or not is_carried_past(reach):
         return None
     if not can_replace_chain(on.problem, on.grid):
         return None
-    on = dataclasses.replace(on, scheme=Upwind(), cut=None)
+    on = on.with_scheme(Upwind())
     try:
         plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
         memory.fitting(arc_bytes(on.grid, plan, on.dtype), on.grid, None)

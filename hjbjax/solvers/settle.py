@@ -84,7 +84,7 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
     evaluation = task.method.evaluation
     # sweeps follow the drift from the target; on a cycle no node is first, and with β Δt ≪ 1 they take 1/(β Δt) rounds
     if code is Status.STALLED and evaluation is not None and evaluation.rough:
-        solver = linear_solve(task.grid) if task.on.mesh is None else Krylov()
+        solver = linear_solve(task.grid) if task.mesh is None else Krylov()
         task = dataclasses.replace(task, method=PolicyIteration(solver))
         state, code, residuals = iterate(task, state.value, clock)
     if code in FAILED:

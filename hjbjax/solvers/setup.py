@@ -5,13 +5,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
-from hjbjax.discretisation import cut_cells, schemes
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian.exact import may_miss
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
@@ -19,7 +19,7 @@ from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
 from hjbjax.markov_chain import attainability, resting
 from hjbjax.markov_chain.attainability import Reach
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, tabulated
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, known
@@ -33,6 +33,7 @@ DIRECT = 50_000  # largest plane grid with open ends that is solved by sparse LU
 # A sweep receives values of the adjacent part only at the next exchange: 1600 x 1601 nodes on two devices took 19 steps
 # of three sweeps and 1.4 s, 14 steps of five and 1.2 s; 800 x 801 nodes take 0.23 s and 0.27 s.
 BETWEEN_PARTS, MANY = 5, 10**6  # sweeps, and the number of nodes above which they are used
+LINKS = 200_000  # largest grid whose cut links are stored: 34 bytes per node and axis, but half the compile time
 NEST = 100_000  # nodes above which compiling coarser grids pays
 COARSEST = 20_000  # nodes of the coarsest grid: for fewer a step takes under a millisecond, but compiling a second
 
@@ -102,7 +103,7 @@ def choose_scheme(on: Discretisation, method: Method) -> Scheme:
     problem, calm = on.problem, Limited().chain
     if method.relaxes or (is_constrained(problem) and is_discounted(problem) is False):
         return Upwind()
-    if problem.noise is not None and bool(_central(dataclasses.replace(on, scheme=calm))):
+    if problem.noise is not None and bool(_central(on.with_scheme(calm))):
         return calm
     return Limited()
 
@@ -111,8 +112,7 @@ def choose_scheme(on: Discretisation, method: Method) -> Scheme:
 def _central(on: Discretisation) -> jax.Array:
     """True if central differences are monotone at all nodes, for every action."""
     on = cast(on, on.dtype)
-    calm = schemes.calm(on, on.coordinates(), cut_cells.links(on))
-    return jnp.all(jnp.stack([jnp.all(axis) for axis in calm]))
+    return jnp.all(jnp.stack([jnp.all(axis) for axis in on.central_nodes(on.coordinates(), on.links)]))
 
 
 def linear_solve(grid: Grid) -> Direct | Krylov:
@@ -122,7 +122,8 @@ def linear_solve(grid: Grid) -> Direct | Krylov:
 
 def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "Assumptions") -> Task:
     """The task of a solve, all arrays in its dtype; pure, so that it may be traced, batched and differentiated."""
-    on = cut_cells.kept(cast(on, on.dtype))
+    on = cast(on, on.dtype)
+    on = on.with_links() if stores_links(on) else on
     obstacles, still = _obstacles(on, assumptions)
     # a tube with a traced discount uses relaxations if it is zero, which only the compiled program can decide
     undecided = assumptions.certificate is Certificate.BY_DISCOUNT and is_constrained(on.problem)
@@ -138,6 +139,11 @@ def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "As
     )  # fmt: skip
 
 
+def stores_links(on: Discretisation) -> bool:
+    """True if a program stores the links cut by a target: the grid is small enough."""
+    return on.cuts_links and on.grid.size <= LINKS
+
+
 def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Standstill | None) -> Scalar | None:
     """A lower bound on all values: the least payment at the end of a run, if no action earns before it.
 
@@ -148,7 +154,7 @@ def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Stan
         return None
     costs = jnp.where(jnp.isfinite(still.least), still.least, 0)
     small = resting.ROUNDINGS * jnp.finfo(on.dtype).eps * jnp.max(jnp.abs(costs))
-    ends = certificates.lowest_end(obstacles, jnp.ones(on.grid.shape, bool), on.grid)
+    ends = certificates.lowest_end(obstacles, jnp.ones(on.grid.shape, bool), on.grid.layout)
     # finite, since values are compared with a multiple of it
     return jnp.where(jnp.all(costs >= -small), ends, jnp.finfo(on.dtype).min / 8).astype(on.dtype)
 
@@ -157,8 +163,8 @@ def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.
     """The obstacles, including rest points, and where the system can rest, if this matters to the problem."""
     obstacles, problem = bellman.obstacles(on), on.problem
     if on.scheme.subcell and problem.exit_cost is not None:
-        links = cut_cells.links(on)
-        met = [jnp.min(jnp.where(*meets, 0)) for link in links for meets in (link.meets_up, link.meets_down) if meets]
+        ends = (meets for link in on.links for meets in (link.meets_up, link.meets_down))
+        met = [jnp.min(jnp.where(*meets, 0)) for meets in ends if meets]
         # a lower bound on V must not exceed any exit cost, also where the boundary is between the nodes
         obstacles = dataclasses.replace(obstacles, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
     if not (assumptions.may_rest or assumptions.costs_certify):
@@ -201,9 +207,9 @@ def assumptions_of(on: Discretisation) -> Assumptions:
     """The assumptions from the structure of the problem; a traced discount leaves the certificate undecided."""
     if on.grid.sides("open"):
         # extrapolated values do not belong to a chain, so none of the bounds holds
-        return dataclasses.replace(assumptions_of(on.on_grid(on.grid.walled)), certificate=Certificate.OPEN)
+        return dataclasses.replace(assumptions_of(on.on_grid(stencil.walled(on.grid))), certificate=Certificate.OPEN)
     problem = on.problem
-    players, discounted = players_of(on), is_discounted(problem)
+    players, discounted = on.players, is_discounted(problem)
     if discounted:
         return Assumptions(Certificate.ADDITIVE, players.exact, may_rest=False)
     fits = problem.running_max is None and problem.cost is not None and not players.disturbance_costs
@@ -216,14 +222,17 @@ def assumptions_of(on: Discretisation) -> Assumptions:
 _prepare_jit = jax.jit(prepare, static_argnames="assumptions")
 
 
-def prepared(on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions) -> Task:
+def prepared(
+    on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions, mesh: Mesh | None = None
+) -> Task:
     """The task of ``prepare`` at host level, with spacings and coordinates as constants of the program."""
-    made = _prepare_jit(on.settled, method=method, tol=tol, assumptions=assumptions)
-    return altered(made, on=altered(made.on, grid=jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)))
+    made = _prepare_jit(on.on_grid(tabulated(on.grid)), method=method, tol=tol, assumptions=assumptions)
+    grid = jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)
+    return altered(made, on=altered(made.on, grid=grid), mesh=mesh)
 
 
 def prepare_on_host(
-    on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None
+    on: Discretisation, *, method: Method, tol: float, clock: Clock | None = None, mesh: Mesh | None = None
 ) -> tuple[Task, Assumptions, Reach | None]:
     """The task of ``prepare``, with the checks that require values: if and where there is a finite solution.
 
@@ -241,8 +250,8 @@ def prepare_on_host(
     if may_miss(on):
         assumptions = dataclasses.replace(assumptions, exact=False)
     if is_bare(method):
-        return *_bare(on, method, tol, assumptions), None
-    task = prepared(on, method=method, tol=tol, assumptions=assumptions)
+        return *_bare(on, method, tol, assumptions, mesh), None
+    task = prepared(on, method=method, tol=tol, assumptions=assumptions, mesh=mesh)
     priced = assumptions.certificate is Certificate.MULTIPLICATIVE
     # where L = 0 the bound by the running cost fails, and a run may cycle indefinitely at no cost, as well as rest
     if (priced and not _costs_positive(task)) or problem.cost is None:
@@ -252,7 +261,7 @@ def prepare_on_host(
         )
     if priced and problem.is_game and not _costs_positive(task) and not method.relaxes:
         # policies that continue indefinitely at no cost have any value; the required one is the limit of long horizons
-        task = prepared(on, method=ValueIteration(), tol=tol, assumptions=assumptions)
+        task = prepared(on, method=ValueIteration(), tol=tol, assumptions=assumptions, mesh=mesh)
     if priced and not _costs_positive(task):
         assumptions = dataclasses.replace(assumptions, certificate=Certificate.NONE)
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
@@ -274,7 +283,9 @@ def is_bare(method: Method) -> bool:
     return method.relaxes and not method.policy
 
 
-def _bare(on: Discretisation, method: Method, tol: float, assumptions: Assumptions) -> tuple[Task, Assumptions]:
+def _bare(
+    on: Discretisation, method: Method, tol: float, assumptions: Assumptions, mesh: Mesh | None
+) -> tuple[Task, Assumptions]:
     """The task and the assumptions of a solve that stores only V, without an array of the nodes."""
     additive = assumptions.certificate is Certificate.ADDITIVE
     if not (additive or is_constrained(on.problem)) or on.grid.sides("open"):
@@ -284,7 +295,10 @@ def _bare(on: Discretisation, method: Method, tol: float, assumptions: Assumptio
         )
     certificate = Certificate.ADDITIVE if additive else Certificate.NONE
     on, nothing = cast(on, on.dtype), bellman.Obstacles(jnp.zeros((), bool), jnp.zeros((), on.dtype))
-    task = Task(on, method, nothing, jnp.ones((), bool), None, None, jnp.asarray(tol, on.dtype), certificate, bare=True)
+    task = Task(
+        on, method, nothing, jnp.ones((), bool), None, None, jnp.asarray(tol, on.dtype), certificate, bare=True,
+        mesh=mesh,
+    )  # fmt: skip
     return task, dataclasses.replace(assumptions, certificate=certificate, may_rest=False)
 
 

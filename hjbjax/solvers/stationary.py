@@ -17,8 +17,8 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.methods import Method, check_method
 from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
-from hjbjax.problem.grid import Grid
-from hjbjax.problem.parts import spans_processes
+from hjbjax.problem.grid import Grid, check_spacings
+from hjbjax.problem.layouts import spans_processes
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import as_one_program, is_traced
 from hjbjax.problem.settings import own_settings
@@ -118,7 +118,7 @@ def solve(
     """
     check_limits(max_steps, time_limit)
     check_arguments(problem, grid, method, scheme, tol, guess)
-    grid.check_indices()  # also inside transformations, where the memory is not checked
+    checks.check_indices(grid)  # also inside transformations, where the memory is not checked
     traced, free = is_traced(problem, grid, guess, tol), method is None
     paths = None if scheme is None else scheme.paths
     if mesh is not None:
@@ -137,7 +137,7 @@ def solve(
         return _solve_traced(problem, grid, asked, guess, tol)
     kind = arguments.as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
-    grid.check_spacings(kind)
+    check_spacings(grid, kind)
     clock = Clock(max_steps or 10**9, time_limit, progress, together=spans_processes(mesh))
     opened = checkpoints.open_checkpoint(
         checkpoint, [problem], grid, resume=resume, caller="solve", together=clock.together, method=method,
@@ -155,7 +155,7 @@ def solve(
             solution = semi_lagrangian.solve_arcs_on_host(problem, grid, scheme, paths, kind, clock=clock, **options)
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
-    on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind, mesh=mesh)
+    on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind)
     choices = Choices(scheme=scheme is None, method=free, levels=free)
     # float64 for this call only: other threads, and the caller's own programs, keep their type
     with (
@@ -168,7 +168,7 @@ def solve(
         check_on_one_state(problem, grid, on.scheme)  # before the memory check, which reads functions
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, choices), clock)
+            solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, choices, mesh), clock)
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats.update(bytes=needed, **({} if mesh is None else {"mesh": mesh.devices.shape}))
     return _ended(solution, clock, tol, throw=throw)

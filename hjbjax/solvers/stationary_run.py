@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.discretisation import on_part, over_nodes
 from hjbjax.iteration import fixed_point
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.progress import HISTORY
-from hjbjax.problem.parts import Lanes, Parts, spans_processes
+from hjbjax.problem.grid import tabulated
+from hjbjax.problem.layouts import Lanes, Layout
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Nodes, Number
 from hjbjax.solution.checkpoints import check_alike
@@ -44,13 +44,13 @@ def _run_lanes(tasks: Task, states: State, until: Array, over: Lanes) -> State:
 
 
 @functools.partial(WideJit, static_argnames="parts", donate_argnames="state")
-def _run_in_parts(task: Task, state: State, until: Number, parts: Parts) -> State:
+def _run_in_parts(task: Task, state: State, until: Number, parts: Layout) -> State:
     """``fixed_point.run`` on all devices of a mesh, each with its own nodes."""
 
     def here(task: Task, state: State, until: Number) -> State:
-        return fixed_point.run(on_part(task, parts), state, until)
+        return fixed_point.run(task.on_part(parts), state, until)
 
-    over = over_nodes(task, parts.entries), state_over_nodes(state), False
+    over = task.over_nodes(parts.entries), state_over_nodes(state), False
     return parts.mapped(here, over, over[1])(task, state, until)
 
 
@@ -74,8 +74,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
       The last state, its status, and the residuals of all steps, starting with the guess.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    parts = task.on.parts
-    iteration = StationaryRun(task, guess, limit) if parts is None else RunInParts(task, guess, limit, parts)
+    iteration = (RunInParts if task.division.axes else StationaryRun)(task, guess, limit)
     if most is not None:
         iteration.name += ", computing a guess"
         iteration.passing = most <= clock.max_steps
@@ -184,7 +183,7 @@ class StationaryRun(StatesInChunks):
     """The iteration of a task of the chain, or of a high-order task based on it."""
 
     def __init__(self, task: Task, guess: Nodes, limit: int):
-        task = altered(task, on=task.on.settled)
+        task = altered(task, on=altered(task.on, grid=tabulated(task.grid)))
         super().__init__(task, fixed_point.start(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
@@ -212,10 +211,11 @@ class StationaryRun(StatesInChunks):
 class RunInParts(StationaryRun):
     """The iteration of a task whose nodes are divided among several devices."""
 
-    def __init__(self, task: Task, guess: Nodes, limit: int, parts: Parts):
+    def __init__(self, task: Task, guess: Nodes, limit: int):
         super().__init__(task, guess, limit)
+        parts = task.division
         self.grid, self.parts, self._over = task.grid, parts, state_over_nodes(self.state)
-        self.task = parts.spread(self.task, over_nodes(self.task, task.grid.shape))
+        self.task = parts.spread(self.task, self.task.over_nodes(task.grid.shape))
         self.before = self.state = parts.spread(self.state, self._over)
         self._run = functools.partial(_run_in_parts, parts=parts)
 
@@ -231,7 +231,7 @@ class RunInParts(StationaryRun):
     def keep(self, error: Exception) -> None:
         """Attach the value to an exception, as without parts."""
         # data in other processes is inaccessible, since they may not have raised this exception
-        states = () if spans_processes(self.parts.mesh) else (self.state, self.before)
+        states = (self.state, self.before) if self.parts.is_local else ()
         values = (lambda s=s: self.parts.gathered(s, self._over).value for s in states)
         host_loop.keep(error, self.grid, *values, lambda: self.guess)
 

@@ -28,7 +28,7 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import memory
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.host_calls import call_on_host
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, is_traced, pytree_dataclass
@@ -156,7 +156,7 @@ def _differentiable(task: Task, scheme: Scheme, found: Found) -> tuple[jax.Array
 
     if scheme.monotone:
         return by(task)
-    sharp = dataclasses.replace(task, on=dataclasses.replace(task.on, scheme=scheme), certificate=Certificate.RESIDUAL)
+    sharp = dataclasses.replace(task, on=task.on.with_scheme(scheme), certificate=Certificate.RESIDUAL)
     if not task.constrained:
         sharp = dataclasses.replace(sharp, obstacles=dataclasses.replace(sharp.obstacles, lower=found.floor))
     return jax.lax.cond(found.sharp, lambda: by(sharp), lambda: by(task))
@@ -164,7 +164,7 @@ def _differentiable(task: Task, scheme: Scheme, found: Found) -> tuple[jax.Array
 
 def _on_arcs(on: Discretisation, found: Found) -> tuple[jax.Array, Greedy]:
     """Value and policy of a solution on arcs, as functions of the numbers in the problem and in the grid."""
-    on = cast(dataclasses.replace(on, scheme=Upwind()), on.dtype)
+    on = cast(on.with_scheme(Upwind()), on.dtype)
     plan = REPLACEMENT.plan(on.problem, on.grid, on.dtype)
     legs = tuple(int(leg) for leg in plan.legs)
     equation = ArcEquation(on, plan.actions, legs, found.arc, found.fixed, found.counted)
@@ -249,7 +249,7 @@ def _solved(
 ) -> Found:
     """The result of one lane, in NumPy; its warnings are dropped, because the user's line is not on the stack."""
     with own_settings(x64=asked.x64), keeping_warnings():
-        grid.check_spacings(asked.inner)
+        check_spacings(grid, asked.inner)
         choices = Choices(scheme=asked.scheme is None, method=method is None, levels=method is None)
         may_follow = _may_follow(asked, problem, grid)
         method = choose(problem, grid, traced=False, method=method)

@@ -1,6 +1,6 @@
-"""Checks of a problem on one state before a solve starts; on the host, never under a tracer.
+"""Checks of a problem on one state, and of a grid, before a solve starts; on the host, never under a tracer.
 
-Every function is traced once and nothing is allocated. Messages name the fault and the remedy.
+Every function of the problem is traced once and nothing is allocated. Messages name the fault and the remedy.
 """
 
 import inspect
@@ -13,7 +13,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.problem import sets
-from hjbjax.problem.arguments import check_mesh
+from hjbjax.problem.arguments import check_count, check_mesh
+from hjbjax.problem.ends import KINDS
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, remembered
@@ -73,6 +74,35 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
         with own_settings(x64=True):
             if len(_shape_or_fault(problem, "noise", n)) == 2:
                 refuse_stretched(grid)
+
+
+def refuse_prescribed(grid: Grid, name: str, why: str) -> None:
+    """Refuse prescribed ends on behalf of a function, with the reason.
+
+    Raises:
+      ValueError: the grid has prescribed ends.
+    """
+    found = sorted({type(end).__name__ for _, _, end in grid.prescribed()})
+    if found:
+        raise ValueError(f"{name}: got a grid with {' and '.join(found)} ends, {why}; use edges='projected'")
+
+
+def check_indices(grid: Grid) -> None:
+    """Refuse a grid that no solve can use, before anything of the size of the grid is allocated or compiled.
+
+    Raises:
+      MemoryError: more nodes than 32-bit indices can number; the message has the largest possible N.
+      ValueError: prescribed ends without their numbers, as on a grid from a file.
+    """
+    check_count(grid.shape)
+    known = {(axis, step) for axis, step, _ in grid.prescribed()}
+    if missing := {side for kind in KINDS for side in grid.sides(kind)} - known:
+        axis, step = min(missing)
+        raise ValueError(
+            f"Grid.edges: the {'upper' if step > 0 else 'lower'} end of {grid.names[axis]} is prescribed, but its "
+            "numbers are unknown, because files do not store them. Make the Grid again with hjb.Dirichlet(value), "
+            "hjb.Neumann(slope) or hjb.Robin(rate)"
+        )
 
 
 def refuse_stretched(grid: Grid) -> None:
@@ -347,7 +377,7 @@ def over_devices(
         return None
     if traced:
         raise ValueError(f"{caller}: mesh divides the nodes at host level only; leave it out inside jit, vmap and grad")
-    grid.refuse_prescribed(caller, "whose numbers are not divided over a mesh")
+    refuse_prescribed(grid, caller, "whose numbers are not divided over a mesh")
     if problem_calls_back(problem, grid.ndim):
         raise ValueError(
             f"{caller}: a function of the problem calls Python on the host; leave out mesh, or write it in JAX"

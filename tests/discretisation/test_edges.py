@@ -14,6 +14,7 @@ from plain_chain import hamiltonians, solved, tables
 
 import hjbjax as hjb
 from hjbjax.discretisation import edges as ends_of_the_box
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.edges import cut
 from hjbjax.discretisation.stencil import continued, inward, sparse
 from hjbjax.markov_chain import chain
@@ -36,7 +37,7 @@ def test_edges_come_as_a_name_or_one_entry_an_axis():
     assert grid.sides("open") == [(0, -1), (0, 1)]
     assert grid.sides("constrained") == [(1, 1)]
     assert dataclasses.replace(grid, shape=(9, 9)).edges == grid.edges
-    assert grid.walled.edges == (("projected", "projected"), ("projected", "constrained"))
+    assert stencil.walled(grid).edges == (("projected", "projected"), ("projected", "constrained"))
 
 
 @pytest.mark.parametrize(
@@ -589,7 +590,7 @@ def test_a_wave_leaves_through_an_open_end(scheme, method, most):
     assert np.max(off) <= 1.15 * 0.5**3 / 6 + most
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", hjb.SolveWarning)
-        walled = hjb.march(problem, grid.walled, 0.5, scheme=scheme, method=method, step=0.01)
+        walled = hjb.march(problem, stencil.walled(grid), 0.5, scheme=scheme, method=method, step=0.01)
     assert np.abs(walled.value[0] - exact)[-1] > 0.2
     assert walled.cut.tolist() == [[[0, 1]]]
 

@@ -19,7 +19,7 @@ class Minmod(Scheme):
     even, points, chain = True, 3, hjb.Upwind()
 
     def slopes(self, around):
-        grid, found = around.on.grid, []
+        grid, found = around.grid, []
         for axis, (up, down) in enumerate(around.one_sided):
             bend = up - down
             above, below = (stencil.neighbour(bend, grid, stencil.unit(grid, axis, step)) for step in (1, -1))

@@ -11,6 +11,7 @@ from scipy.sparse.linalg import spsolve
 from systems import SEEDS
 
 import hjbjax as hjb
+from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.hamiltonian import discrete, optimum
@@ -219,7 +220,7 @@ def test_the_hamiltonian_at_walls_is_that_of_the_chain(central, subcell, seed):
     """H = L + 𝓛V under one policy, on all nodes, with diagonal jumps across edges and corners."""
     rng = np.random.default_rng(seed)
     grid = hjb.Grid([0.0, 0.0], [1.0, 1.0], (3, 4), edges=["projected", ("open", "projected")])
-    grid = grid if central else grid.walled
+    grid = grid if central else stencil.walled(grid)
     slope, root = rng.normal(size=(2, 2)), np.array([[1.0, 0.0], [rng.uniform(-0.4, 0.4), 0.8]])
     problem = hjb.Problem(lambda x, u: jnp.asarray(slope) @ x + u, None, hjb.Box([-9.0] * 2, [9.0] * 2), noise=root)
     with jax.enable_x64(True):

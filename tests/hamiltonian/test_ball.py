@@ -12,7 +12,8 @@ from scipy.optimize import minimize
 from systems import SEEDS
 
 import hjbjax as hjb
-from hjbjax.hamiltonian.ball import combinations, kinked_ball, least_in_ball
+from hjbjax.discretisation.players import combinations
+from hjbjax.hamiltonian.ball import kinked_ball, least_in_ball
 from hjbjax.hamiltonian.piecewise import Kinked
 
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from systems import SEEDS, random_game, random_grid, random_problem, random_sigma
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.players import SAMPLES, find_players
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.hamiltonian import discrete, optimum
-from hjbjax.hamiltonian.players import SAMPLES, find_players
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass

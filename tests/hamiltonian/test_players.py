@@ -7,7 +7,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian.players import find_players
+from hjbjax.discretisation.players import find_players
 from hjbjax.solvers.setup import assumptions_of
 
 LINE = hjb.Grid([-2.0], [2.0], (21,))

@@ -13,7 +13,6 @@ from scipy.optimize import minimize
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.hamiltonian import discrete, exact, optimum
-from hjbjax.hamiltonian.players import players_of
 from hjbjax.hamiltonian.quadratic_program import is_convex
 from hjbjax.problem.pytree import cast
 
@@ -58,7 +57,7 @@ def found(problem, value, dtype=np.float64):
     on = cast(Discretisation(problem, GRID, hjb.Upwind(), dtype), dtype)
     hamiltonian = discrete.around(on, jnp.asarray(value, dtype))
     best, u, _ = optimum.optimise(hamiltonian)
-    missed = exact.optimum_error(hamiltonian, players_of(hamiltonian.on).control, lambda u: (u, []))
+    missed = exact.optimum_error(hamiltonian, hamiltonian.on.players.control, lambda u: (u, []))
     return best, jnp.stack([jnp.broadcast_to(each, SHAPE) for each in u], -1), missed
 
 

@@ -11,9 +11,9 @@ from systems import SEEDS
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.players import find_players
 from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.optimum import optimise
-from hjbjax.hamiltonian.players import find_players
 from hjbjax.hamiltonian.search import UNROLL, enumerate_actions, optimum, refine
 
 NODES = 6

@@ -38,7 +38,7 @@ def measured(kind, problem, grid, value, obstacles, least_cost, counted, moved):
     on = Discretisation(problem, grid, Upwind(), value.dtype)
     policy = bellman.greedy(on, value, obstacles.fixed)
     equation = bellman.policy_equation(on, value, policy, obstacles)
-    iterate = certificates.Iterate(grid, value, policy, equation, obstacles, counted)
+    iterate = certificates.Iterate(grid.layout, value, policy, equation, obstacles, counted)
     bound = certificates.error_bound(kind, iterate, discount=problem.discount, least_cost=least_cost, moved=moved)
     return bound, equation
 

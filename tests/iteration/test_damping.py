@@ -38,5 +38,5 @@ def test_a_correction_turns_back_where_v_changed_most(sign):
     grid = Grid([0.0], [1.0], (5,))
     change = sign * jnp.array([0.1, 1.0, 0.8, 0.1, 0.0])
     onwards = sign * jnp.array([-9.0, 0.2, -0.1, -9.0, -9.0])  # elsewhere V may ask for what it likes
-    assert not turns_back(grid, change, onwards)
-    assert turns_back(grid, change, -onwards)
+    assert not turns_back(grid.layout, change, onwards)
+    assert turns_back(grid.layout, change, -onwards)

@@ -12,6 +12,7 @@ import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point, progress
 from hjbjax.iteration.certificates import ErrorBound
+from hjbjax.problem.grid import tabulated
 from hjbjax.solution.status import Status
 from hjbjax.solvers.setup import prepare_on_host
 
@@ -110,7 +111,7 @@ def test_chunks_of_value_iteration_change_no_bit():
     """The actions are computed at the end of a chunk, with a defect that differs by rounding from the loop's."""
     box, grid = hjb.Box([-1.0], [1.0]), hjb.Grid([-2.0, -2.0], [2.0, 2.0], (21, 20), periodic=(False, True))
     problem = hjb.Problem(pushed, quadratic, box, discount=1.0, disturbances=box)
-    on = Discretisation(problem, grid, hjb.Upwind(), np.float64).settled
+    on = Discretisation(problem, tabulated(grid), hjb.Upwind(), np.float64)
     task, _, _ = prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-12)
     assert task.by_defect
     run = jax.jit(fixed_point.run)

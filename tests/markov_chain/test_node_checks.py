@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from small_problems import GRID, U, accepted, in_disc, refused
 
 from hjbjax import Box, Finite, Grid, Problem
-from hjbjax.discretisation import correlated_noise
+from hjbjax.discretisation import correlated_noise, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import node_checks
@@ -91,7 +91,7 @@ def test_another_parameter_value_does_not_trace_again():
 
 def least(a, grid):
     table = {(i, j): jnp.asarray(a[i, j]) for i in range(len(a)) for j in range(i, len(a))}
-    return min(float(correlated_noise.along_axis(table, grid, axis)) / a[axis, axis] for axis in range(len(a)))
+    return min(float(stencil.noise_along(table, grid, axis)) / a[axis, axis] for axis in range(len(a)))
 
 
 @pytest.mark.parametrize("sigma", [[[1.0, 0.0], [2.0, 0.0]], [[1.0, 0.0], [0.9, 0.1]], [[1.0, 0.3], [-3.0, 0.2]]])

@@ -1,6 +1,7 @@
 """Dataclasses that JAX looks through: round trips, host fields, no validation on the way back."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -280,6 +281,19 @@ def test_a_copy_may_hold_what_the_checks_refuse():
     assert changed.drift is problem.drift
     with pytest.raises(ValueError, match="running_max"):
         dataclasses.replace(problem, discount=1.0)
+
+
+def test_altered_copies_compute_cached_properties_again():
+    @pytree_dataclass()
+    class Square:
+        side: float
+
+        @functools.cached_property
+        def area(self):
+            return self.side**2
+
+    one = Square(2.0)
+    assert (one.area, altered(one, side=3.0).area, one.area) == (4.0, 9.0, 4.0)
 
 
 def test_a_tied_tree_has_both_derivatives_where_only_one_leaf_moves():

@@ -22,7 +22,8 @@ import hjbjax as hjb
 from hjbjax.discretisation import slopes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import gauss_seidel
-from hjbjax.problem.parts import Parts
+from hjbjax.problem.grid import placed
+from hjbjax.problem.layouts import Parts
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solvers import setup, stationary_run
@@ -175,8 +176,9 @@ def read_of_others(grid, value, mask):
         "walls": [jnp.broadcast_to(stencil.walls(grid, axis), value.shape) for axis in range(grid.ndim)],
         "coordinates": [jnp.broadcast_to(x, value.shape) for x in grid.components(value.dtype)],
     }
-    places = [grid.first(value > 2), grid.first(value > 100), grid.some(value > 2), grid.some(value > 100)]
-    return read, [grid.largest(value), grid.least(value), *places, grid.total(jnp.round(100 * value))]
+    layout = grid.layout
+    places = [find(mask) for find in (layout.first, layout.some) for mask in (value > 2, value > 100)]
+    return read, [layout.largest(value), layout.least(value), *places, layout.total(jnp.round(100 * value))]
 
 
 @case
@@ -190,10 +192,10 @@ def stencils():
     }
     found = {}
     for name, (grid, shape) in grids.items():
-        parts, value = Parts(mesh_of(*shape), grid.shape), np.random.default_rng(0).normal(size=grid.shape)
+        parts, value = Parts(grid.shape, mesh_of(*shape)), np.random.default_rng(0).normal(size=grid.shape)
 
         def here(grid, value, mask, parts=parts):
-            return read_of_others(grid.divided(parts), value, mask)
+            return read_of_others(placed(grid, parts), value, mask)
 
         with jax.enable_x64(True):
             given, over = (grid, value, value > 0), (jax.tree.map(lambda _: False, grid), True, True)
@@ -211,13 +213,13 @@ def stencils():
 @case
 def not_a_number_is_not_lost():
     """A NaN at one node of one part is the largest of all."""
-    parts = Parts(mesh_of(4, 2), FLAT.shape)
+    parts = Parts(FLAT.shape, mesh_of(4, 2))
     values = np.zeros(FLAT.shape, np.float32)
     values[30, 3] = np.nan
 
     def here(grid, values):
-        grid = grid.divided(parts)
-        return grid.largest(values), grid.least(values)
+        grid = placed(grid, parts)
+        return grid.layout.largest(values), grid.layout.least(values)
 
     given = jax.tree.map(lambda _: False, FLAT), True
     found = jax.jit(parts.mapped(here, given, (False, False)))(*parts.spread((FLAT, values), given))
@@ -230,10 +232,10 @@ def compiled_program():
     found = {}
     with jax.enable_x64(True):
         for shape in ((8,), (4, 2)):
-            on = Discretisation(PLAIN, ANGLE, hjb.Upwind(), np.float64, mesh=mesh_of(*shape))
-            task, *_ = setup.prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3)
-            parts = on.parts
-            run = stationary_run.RunInParts(task, np.zeros(ANGLE.shape), 10, parts)
+            on = Discretisation(PLAIN, ANGLE, hjb.Upwind(), np.float64)
+            task, *_ = setup.prepare_on_host(on, method=hjb.ValueIteration(), tol=1e-3, mesh=mesh_of(*shape))
+            parts = task.division
+            run = stationary_run.RunInParts(task, np.zeros(ANGLE.shape), 10)
             text = stationary_run._run_in_parts.lower(run.task, run.state, 5, parts=parts).compile().as_text()
             names = ("collective-permute", "all-gather", "all-to-all", "all-reduce")
             found["x".join(map(str, shape))] = {

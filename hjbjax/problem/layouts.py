@@ -1,11 +1,11 @@
-"""The nodes of a grid in parts, one per device of a mesh, and the exchange of values between parts.
+"""Layouts of the nodes of a grid: all on one device, or in parts, one per device of a mesh.
 
-Domain decomposition by ``jax.shard_map``: every device runs the single-device program on its part of the grid. It
-fetches the nodes just beyond its part from the neighbouring parts by ``ppermute`` and reduces by ``pmax`` or ``psum``.
-The i-th axis of the mesh divides the i-th axis of the grid. With N nodes, part k of p has the nodes from ⌊kN/p⌋ up to
-⌊(k + 1)N/p⌋, so that parts differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node less
-has a filler as its last entry, a copy of the next node. No node reads the value computed at a filler, and reductions
-ignore fillers.
+A layout exchanges values between parts and reduces over all nodes. Parts are a domain decomposition by
+``jax.shard_map``: every device runs the single-device program on its part of the grid. It fetches the nodes just beyond
+its part from the neighbouring parts by ``ppermute`` and reduces by ``pmax`` or ``psum``. The i-th axis of the mesh
+divides the i-th axis of the grid. With N nodes, part k of p has the nodes from ⌊kN/p⌋ up to ⌊(k + 1)N/p⌋, so that parts
+differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node less has a filler as its last
+entry, a copy of the next node. No node reads the value computed at a filler, and reductions ignore fillers.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hjbjax.problem.types import AtNodes, Mask, Scalar
+from hjbjax.problem.types import Array, AtNodes, Mask, Scalar, Verdict
 
 T = TypeVar("T")
 FEWEST = 3  # nodes of a part along a divided axis: the reach of Weno5 and of a parabola beyond an end
@@ -26,16 +26,124 @@ FEWEST = 3  # nodes of a part along a divided axis: the reach of Weno5 and of a 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Parts:
-    """The nodes of a grid over the devices of a mesh. Traced methods work only inside ``shard_map``.
+class Layout:
+    """The nodes of a grid in the arrays of this device: all of them on one device; see ``Parts`` for several.
 
     Args:
-      mesh: the devices, with at most as many axes as the grid.
       whole: the number of nodes of the whole grid along every axis.
     """
 
-    mesh: Mesh
     whole: tuple[int, ...]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The number of parts along every axis."""
+        return (1,) * len(self.whole)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of entries of one part's arrays along every axis."""
+        return tuple(-(-count // size) for count, size in zip(self.whole, self.sizes, strict=True))
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The axes of the grid that are divided."""
+        return tuple(axis for axis, size in enumerate(self.sizes) if size > 1)
+
+    def is_divided(self, axis: int) -> bool:
+        """True if the nodes along an axis are divided over several devices, so that this part holds some of them."""
+        return self.sizes[axis] > 1
+
+    def even(self, axis: int) -> bool:
+        """True if all parts have the same number of nodes along an axis."""
+        return self.whole[axis] % self.sizes[axis] == 0
+
+    def count(self, axis: int) -> int | Scalar:
+        """The number of nodes of this part along an axis; a known number if all parts have the same number."""
+        return self.whole[axis]
+
+    def last(self, axis: int, step: int) -> Array:
+        """The entries that hold the last node of an axis in the direction of ``step``, bool."""
+        # NumPy, so that it is a small constant
+        return np.arange(self.whole[axis]) == (self.whole[axis] - 1 if step > 0 else 0)
+
+    def own(self, table: Any, axis: int) -> Any:
+        """This part's entries of a table of all nodes along an axis."""
+        return table
+
+    def at_end(self, axis: int, step: int) -> Verdict | bool:
+        """True if this part is at the end of an axis in the direction of ``step``."""
+        return True
+
+    def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
+        """The values of the neighbouring part in the direction of ``step``; zero beyond the ends unless cyclic."""
+        return values
+
+    def cleared(self, values: AtNodes) -> AtNodes:
+        """Node values with zeros in the fillers."""
+        return values
+
+    def largest(self, values: AtNodes) -> Scalar:
+        """The largest of the values at all nodes; NaN if one of them is NaN."""
+        return jnp.max(values)
+
+    def least(self, values: AtNodes) -> Scalar:
+        """The smallest of the values at all nodes; NaN if one of them is NaN."""
+        return jnp.min(values)
+
+    def total(self, values: AtNodes) -> Scalar:
+        """The sum of the values at all nodes."""
+        return jnp.sum(values)
+
+    def some(self, mask: Mask) -> Verdict:
+        """True if a mask holds at some node."""
+        return jnp.any(mask)
+
+    def first(self, mask: Mask) -> Scalar:
+        """The smallest index in C order of the nodes of a mask, (*grid); −1 for an empty mask."""
+        return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
+
+    # On the host: arrays of the whole grid and arrays of all parts.
+
+    @property
+    def entries(self) -> tuple[int, ...]:
+        """The shape of an array of all parts, including fillers."""
+        return tuple(width * size for width, size in zip(self.shape, self.sizes, strict=True))
+
+    @property
+    def is_local(self) -> bool:
+        """True if this process holds all parts."""
+        return True
+
+    def spread(self, tree: T, over_nodes: Any) -> T:
+        """Divide arrays of the whole grid over the devices, and copy the others to every device.
+
+        Args:
+          tree: numbers and arrays.
+          over_nodes: a tree of the same structure, True for leaves with one value per node, (*grid).
+        """
+        return tree
+
+    def gathered(self, tree: T, over_nodes: Any) -> T:
+        """The inverse of ``spread``: NumPy arrays of the whole grid if it is divided."""
+        return tree
+
+    def mapped(self, function: Callable, over_nodes: Any, result_over_nodes: Any) -> Callable:
+        """A function that runs on every device at once, each with its own part of arrays from ``spread``."""
+        return function
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Parts(Layout):
+    """The nodes of a grid over the devices of a mesh. Traced methods work only inside ``shard_map``.
+
+    Args:
+      whole: the number of nodes of the whole grid along every axis.
+      mesh: the devices, with at most as many axes as the grid.
+    """
+
+    mesh: Mesh
 
     @property
     def names(self) -> tuple[str | None, ...]:
@@ -50,23 +158,9 @@ class Parts:
         return (*self.mesh.devices.shape, *[1] * (len(self.whole) - self.mesh.devices.ndim))
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """The number of entries of one part's arrays along every axis."""
-        return tuple(-(-count // size) for count, size in zip(self.whole, self.sizes, strict=True))
-
-    @property
-    def axes(self) -> tuple[int, ...]:
-        """The axes of the grid that are divided."""
-        return tuple(axis for axis, name in enumerate(self.names) if name is not None)
-
-    @property
     def fits(self) -> bool:
         """True if no part has fewer nodes than a stencil reads."""
         return all(self.whole[axis] // self.sizes[axis] >= FEWEST for axis in self.axes)
-
-    def even(self, axis: int) -> bool:
-        """True if all parts have the same number of nodes along an axis."""
-        return self.whole[axis] % self.sizes[axis] == 0
 
     def _starts(self, axis: int) -> np.ndarray:
         """The first node of every part along an axis, followed by the number of nodes, (p + 1,)."""
@@ -84,20 +178,13 @@ class Parts:
         width = self.shape[axis]
         return np.concatenate([k * width + np.arange(n) for k, n in enumerate(np.diff(starts))])
 
-    # On the host: arrays of the whole grid and arrays of all parts.
-
     @property
-    def entries(self) -> tuple[int, ...]:
-        """The shape of an array of all parts, including fillers."""
-        return tuple(width * size for width, size in zip(self.shape, self.sizes, strict=True))
+    def is_local(self) -> bool:
+        """True if this process holds all parts."""
+        return not spans_processes(self.mesh)
 
     def spread(self, tree: T, over_nodes: Any) -> T:
-        """Divide arrays of the whole grid over the devices, and copy the others to every device.
-
-        Args:
-          tree: numbers and arrays.
-          over_nodes: a tree of the same structure, True for leaves with one value per node, (*grid).
-        """
+        """Divide arrays of the whole grid over the devices, and copy the others to every device."""
 
         def put(leaf: Any, divided: bool) -> jax.Array:
             host = np.asarray(leaf)
@@ -155,9 +242,10 @@ class Parts:
         start = jnp.asarray(self._starts(axis)[:-1], jnp.int32)[self.index(axis)]
         return start + jnp.arange(self.shape[axis], dtype=jnp.int32)
 
-    def last(self, axis: int, step: int) -> jax.Array:
-        """The entries that hold the last node of a divided axis in the direction of ``step``, bool."""
-        return self.nodes(axis) == (self.whole[axis] - 1 if step > 0 else 0)
+    def last(self, axis: int, step: int) -> Array:
+        """The entries that hold the last node of an axis in the direction of ``step``, bool."""
+        nodes = self.nodes(axis) if self.is_divided(axis) else np.arange(self.whole[axis])
+        return nodes == (self.whole[axis] - 1 if step > 0 else 0)
 
     def own(self, table: Any, axis: int) -> Any:
         """This part's entries of a table of all nodes along an axis."""
@@ -171,6 +259,8 @@ class Parts:
 
     def fetched(self, values: T, axis: int, step: int, *, cyclic: bool) -> T:
         """The values of the neighbouring part in the direction of ``step``; zero beyond the ends unless cyclic."""
+        if not self.is_divided(axis):
+            return values
         last, size = self.sizes[axis] - 1, self.sizes[axis]
         pairs = [((k + step) % size, k) for k in range(size) if cyclic or k != (last if step > 0 else 0)]
         return jax.lax.ppermute(values, self.names[axis], pairs)
@@ -200,6 +290,10 @@ class Parts:
     def largest(self, values: AtNodes) -> jax.Array:
         """The largest of the values at all nodes; NaN if one of them is NaN."""
         return self._reduced(values, jnp.max, _largest, -jnp.inf)
+
+    def least(self, values: AtNodes) -> jax.Array:
+        """The smallest of the values at all nodes; NaN if one of them is NaN."""
+        return -self.largest(-values)
 
     def total(self, values: AtNodes) -> jax.Array:
         """The sum of the values at all nodes."""

@@ -16,6 +16,7 @@ moves first faces a function with ridges, which is searched.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,8 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian.ball import combinations
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
 from hjbjax.tracing import dependence
@@ -148,12 +147,6 @@ class Players:
         return all(player.exact or player.enumerated for player in self.both)
 
 
-def players_of(on: Discretisation) -> Players:
-    """The players of a problem on its grid; players whose drifts are upwinded separately are decoupled there."""
-    players = find_players(on.problem, on.grid.ndim, on.dtype)
-    return dataclasses.replace(players, decoupled=players.decoupled or on.apart)
-
-
 def find_players(problem: Problem, n: int, dtype: Any) -> Players:
     """The players of a problem with ``n`` states, read from its functions."""
     found = dependence.influence(problem, n, dtype)
@@ -210,6 +203,11 @@ def _groups(driven: Sequence[tuple[int, ...]], products: frozenset[tuple[int, ..
         joined = [*(k for group in meets for k in group), j]
         groups = [group for group in groups if group not in meets] + [joined]
     return tuple(tuple(sorted(group)) for group in sorted(groups))
+
+
+def combinations(pieces: Sequence[int]) -> int:
+    """The number of combinations for inputs whose gains have the given numbers of pieces, with kinks between them."""
+    return math.prod(2 * count - 1 for count in pieces)
 
 
 def shared(driven: Sequence[tuple[int, ...]], group: Sequence[int]) -> tuple[int, ...]:

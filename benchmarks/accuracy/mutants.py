@@ -89,7 +89,7 @@ MUTANTS = (
     Mutant(
         "discount of a march",
         "iteration/time_stepping.py",
-        "return best - self.problem.discount * value, self.look(value, u, d, t)",
+        "return best - on.decay * value, self.look(value, u, d, t)",
         "return best, self.look(value, u, d, t)",
         ("tests/discretisation/test_schemes.py",),
     ),

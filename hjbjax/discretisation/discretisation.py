@@ -192,7 +192,8 @@ class Discretisation:
     @property
     def level(self) -> jax.Array:
         """l at every node, (*grid), with an exact zero where it is zero up to rounding; ≤ 0 in the target."""
-        return cut_cells.level(self.at_nodes(self.problem.target), self.grid)
+        # a target may return integers
+        return cut_cells.level(jnp.asarray(self.at_nodes(self.problem.target), self.dtype), self.grid)
 
     @property
     def cuts_links(self) -> bool:

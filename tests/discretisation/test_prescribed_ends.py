@@ -121,6 +121,7 @@ def test_a_reflecting_wall():
     assert solution.box_error is None
 
 
+@pytest.mark.slow
 def test_derivatives_batches_and_files(tmp_path):
     """Prescribed numbers are leaves: a batch and a gradient see them, and a file keeps the kinds."""
     problem, _, scale = exponential()

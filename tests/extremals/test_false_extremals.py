@@ -135,7 +135,7 @@ def test_a_start_at_rest():
     assert hjb.pontryagin(problem, [0.0, 0.0]).cost == pytest.approx(0, abs=1e-12)
 
 
-@pytest.mark.parametrize("unit", [1e-9, 1e6])
+@pytest.mark.parametrize("unit", [pytest.param(1e-9, marks=pytest.mark.slow), 1e6])
 def test_lengths_in_any_unit(unit):
     """tanh(T) x², and least time 2 √(x/a): a length of 1e-9 is below every absolute tolerance."""
     calm = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-9 * unit], [9 * unit]))

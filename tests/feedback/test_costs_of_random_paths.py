@@ -153,6 +153,7 @@ def test_paths_with_noise_cost_it_in_the_mean():
 
 
 @pytest.mark.filterwarnings("ignore:the grid is coarse", "ignore:the box decides")
+@pytest.mark.slow
 def test_numbers_in_single_precision_do_not_hide_where_to_stop():
     """1 + c in single precision is another number than in the solve: V was not ψ, and the path never stopped."""
     problem = stopped(*jnp.asarray([0.4937225, 0.31637814, 0.33716197], jnp.float32))

@@ -62,6 +62,7 @@ def test_a_path_ends_on_the_boundary_of_a_disc_wherever_the_output_times_fall(ra
         assert np.all(np.isfinite(path.controls))
 
 
+@pytest.mark.slow
 def test_a_path_ends_on_the_boundary_of_a_hollow_target_in_cells_without_a_control():
     problem, solution = to_disc(1.0, side=-1.0)
     for angle in np.linspace(0.0, 1.5, 7):

@@ -105,7 +105,7 @@ def test_the_optimum_in_a_ball_has_two_derivatives():
         np.testing.assert_allclose(bend(b), differences, atol=1e-7)
 
 
-@pytest.mark.parametrize("curved", [False, True])
+@pytest.mark.parametrize("curved", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_slopes_of_an_optimum_are_its_actions(curved):
     """∂/∂b of min (b·u + ...) is u, by the formulas' own derivatives: finite also where inputs sit at kinks."""
     rng = np.random.default_rng(3)

@@ -106,7 +106,9 @@ def swung(x, u):
 SWUNG = hjb.Problem(lambda x, u: -x, lambda x, u: x[0] * x[1], UNIT, noise=swung, discount=1.0)
 
 
-@pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Explicit(stages=2), hjb.Implicit()])
+@pytest.mark.parametrize(
+    "method", [hjb.Explicit(), hjb.Explicit(stages=2), pytest.param(hjb.Implicit(), marks=pytest.mark.slow)]
+)
 def test_a_march_stops_where_its_noise_cannot_be_represented(method):
     """The noise is fine at t = 0, where a problem is looked at before it starts."""
     with pytest.raises(hjb.SolveError, match="correlated noise that the chain cannot represent") as caught:

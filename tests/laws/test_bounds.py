@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from random_problems import BY_NAME, FAMILIES, draw
 from systems import SEEDS
 
-EVERY_TIME = ("line", "line, stop", "time, line", "reach, line", "game, finite")
+EVERY_TIME = ("line", "line, stop", "reach, line", "game, finite")
 EACH, SOME = 16, 4  # problems of a family, where every run has it and where only the long run has it
 
 # Shrinking the seed of a generator makes nothing simpler.

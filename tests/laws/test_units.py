@@ -162,6 +162,7 @@ def test_nor_does_a_march(name, method):
         np.testing.assert_allclose(found.value / cost, known.value, rtol=1e-6, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_nor_does_an_implicit_march_of_small_costs():
     """Without a tolerance of the user's it is a part of what V spans: 1e-6 was all of it, and 83 % of V was missing."""
     options = {"method": hjb.Implicit(), "step": 0.05, "scheme": hjb.Upwind(split=True)}

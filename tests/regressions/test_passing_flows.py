@@ -164,6 +164,7 @@ def test_three_states():
 
 
 @pytest.mark.filterwarnings("ignore:the grid is coarse")
+@pytest.mark.slow
 def test_what_the_chain_can_do_stays_with_the_chain():
     """A mass brought to rest near the origin: all nodes are reached, and nothing is followed."""
     problem, grid = zoo.double_integrator(shape=(21, 21))
@@ -212,6 +213,7 @@ def test_a_flow_has_its_own_times():
     np.testing.assert_allclose(inside, found.value, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_flow_arrives_or_does_not():
     grid = square(31)
     with warnings.catch_warnings():

@@ -79,7 +79,7 @@ def missed(problem, solution, x0, duration):
     return abs(path.cost - path.promised) / extent, path
 
 
-CHEAP = ("stopping", "start")
+CHEAP = ("stopping",)
 CASES = [pytest.param(kind, 1, marks=() if kind in CHEAP else pytest.mark.slow) for kind in KINDS]
 
 
@@ -130,6 +130,7 @@ def test_noisy_paths_of_a_march_stop_and_cost_what_v_promises_in_the_mean():
     assert abs(cost.mean() - float(solution.value_at(0.0, [0.55]))) < 4 * deviation < 0.04
 
 
+@pytest.mark.slow
 def test_one_had_better_stop_at_once():
     """V = ψ = 0.2; the path ran on to the horizon and cost 1."""
     problem = hjb.Problem(
@@ -140,6 +141,7 @@ def test_one_had_better_stop_at_once():
     assert path.cost == path.promised == pytest.approx(0.2, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_feedback_continues_v_beyond_an_open_end_as_the_scheme_does():
     """V was clamped there: with noise its second difference was that of a wall, and u was 0.05 and 3 at the ends."""
     problem = hjb.Problem(

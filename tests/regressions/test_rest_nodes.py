@@ -97,7 +97,7 @@ def fast(rate, x, u):
 @pytest.mark.parametrize(
     ("cost", "rate", "dtype"),
     [
-        (1e-3, 1.0, "float32"),
+        pytest.param(1e-3, 1.0, "float32", marks=pytest.mark.slow),
         (1e-4, 1.0, "float32"),
         (1e-13, 1.0, None),
         (1e9, 1e6, None),

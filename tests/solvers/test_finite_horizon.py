@@ -47,6 +47,7 @@ TWICE_AS_LONG = hjb.Tableau((0.0, 0.0, 1 / 3), 1 / 2)  # of order 2 in three sta
 # --- exact answers ---
 
 
+@pytest.mark.slow
 def test_riccati_in_time_has_the_order_of_its_stages():
     """V = tanh(T) x²: the slopes of Weno5 are exact on a quadratic, so that only the steps in time err."""
     for stages, order in [(1, 1), (2, 2), (3, 3), (4, 3), (TWICE_AS_LONG, 2)]:

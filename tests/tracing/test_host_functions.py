@@ -46,6 +46,7 @@ def test_doubles_are_not_rounded_on_their_way(form):
 
 
 @pytest.mark.filterwarnings("ignore:the primitive 'pure_callback'")
+@pytest.mark.slow
 def test_a_solve_and_a_path_with_a_drift_in_numpy():
     called, known = (
         hjb.Problem(lambda x, u, f=f: u - f(x), lambda x, u: x @ x + u @ u, U, discount=1.0) for f in (sine, jnp.sin)

@@ -38,7 +38,7 @@ def box(dim):
     return hjb.Box([-1.0] * dim, [1.0] * dim)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("dim", [1, 2])
 @pytest.mark.parametrize("noise", [None, 0.3])
 def test_a_solve_traces_the_drift_at_most_three_times(dim, noise, dtype):
@@ -65,7 +65,7 @@ def test_so_does_a_game():
     assert drift.calls <= TRACES
 
 
-@pytest.mark.parametrize("method", [None, hjb.Implicit()])
+@pytest.mark.parametrize("method", [None, pytest.param(hjb.Implicit(), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Weno5()])
 def test_so_does_a_march(scheme, method):
     if method is not None and not scheme.monotone:

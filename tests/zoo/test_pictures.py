@@ -98,6 +98,7 @@ def test_a_constant_control_is_drawn_level_and_not_as_its_rounding():
     assert line.axes.get_ylim() == pytest.approx((-0.75, -0.25), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_joined_paths_discount_what_comes_later():
     problem = Problem(lambda x, u: 0 * x + 1, lambda x, u: 1.0, discount=0.5)
     first, then = (simulate(problem, None, [x0], 2.0, steps=4) for x0 in (0.0, 2.0))

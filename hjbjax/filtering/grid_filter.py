@@ -23,9 +23,9 @@ from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.feedback.measurement import Measurement, check_step, measurement, plant, sample_of
 from hjbjax.filtering import forward_equation, resolution, transport
 from hjbjax.filtering.forward_equation import advanced, cells
+from hjbjax.filtering.measurement import Measurement, check_step, measurement, plant, sample_of
 from hjbjax.markov_chain.decision_process import refuse
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid

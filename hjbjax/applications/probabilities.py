@@ -21,7 +21,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind, check_slopes
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.iteration.methods import ValueIteration
-from hjbjax.markov_chain import attainability, memory, node_checks
+from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -33,6 +33,7 @@ from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import check_arguments, solve
 from hjbjax.tracing import checks
 from hjbjax.tracing.interpreter import FallbackWarning
+from hjbjax.well_posedness import attainability, node_checks
 
 TOL = 1e-6  # the default 1e-3 of ``solve`` would show in the third digit of a probability
 

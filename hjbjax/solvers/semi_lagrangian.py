@@ -20,8 +20,7 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Sweeps
 from hjbjax.iteration.methods import Method
 from hjbjax.iteration.progress import HISTORY
-from hjbjax.markov_chain import memory, node_checks
-from hjbjax.markov_chain.attainability import Reach
+from hjbjax.markov_chain import memory
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem, is_discounted
@@ -36,6 +35,8 @@ from hjbjax.solvers.host_loop import FIRST_NODES, WideJit
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
 from hjbjax.solvers.setup import check_on_one_state, is_carried_past, warn_unreached
 from hjbjax.solvers.stationary_run import StatesInChunks
+from hjbjax.well_posedness import node_checks
+from hjbjax.well_posedness.attainability import Reach
 
 REPLACEMENT = SemiLagrangian()  # replaces the chain if this is carried past the target
 REASON = (

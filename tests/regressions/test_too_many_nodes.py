@@ -92,7 +92,7 @@ def test_a_dry_run_of_such_a_grid_ends_with_six(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("scheme", [None, hjb.Upwind(), hjb.SemiLagrangian()], ids=str)
 def test_what_does_not_fit_is_refused_before_the_nodes_are_looked_at(scheme, monkeypatch):
-    from hjbjax.markov_chain import node_checks
+    from hjbjax.well_posedness import node_checks
 
     monkeypatch.setattr(node_checks, "check_values", None)
     grid = hjb.Grid([-1.0] * 2, [1.0] * 2, (40_000, 40_001))

@@ -10,8 +10,6 @@ from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, from_hj_reachability, reach, reach_avoid
-from hjbjax.applications.resources import estimate
-from hjbjax.cli.compile_cache import keep_compiled
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
@@ -35,7 +33,9 @@ from hjbjax.solution.files import FileError
 from hjbjax.solution.solution import Solution, SolveError, load
 from hjbjax.solution.status import SolveWarning, Status
 from hjbjax.solvers.batch import solve_batch
+from hjbjax.solvers.compile_cache import keep_compiled
 from hjbjax.solvers.finite_horizon import march
+from hjbjax.solvers.resources import estimate
 from hjbjax.solvers.stationary import solve
 from hjbjax.tracing.interpreter import FallbackWarning
 

@@ -2,5 +2,5 @@
 
 ``chain`` exports the generator, ``stationary_law`` computes stationary distributions, and ``decision_process`` builds
 the decision problem. ``forward_equation`` moves a law forward in time, and ``transport`` keeps it sharp where there is
-little noise. ``memory`` checks that a solve has room.
+little noise.
 """

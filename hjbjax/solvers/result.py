@@ -19,10 +19,10 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST, Labels
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.types import Field, Nodes, Scalar
-from hjbjax.solution import grid_error
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
+from hjbjax.solvers import grid_error
 from hjbjax.solvers.arrival import warn_of_no_arrival
 from hjbjax.solvers.coarser_answer import CoarserAnswer
 from hjbjax.solvers.settle import Settled

@@ -20,7 +20,6 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Sweeps
 from hjbjax.iteration.methods import Method
 from hjbjax.iteration.progress import HISTORY
-from hjbjax.markov_chain import memory
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem, is_discounted
@@ -30,7 +29,7 @@ from hjbjax.problem.types import DType, Mask, Nodes
 from hjbjax.solution.clock import CUT, Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop
+from hjbjax.solvers import host_loop, memory
 from hjbjax.solvers.host_loop import FIRST_NODES, WideJit
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
 from hjbjax.solvers.setup import check_on_one_state, is_carried_past, warn_unreached

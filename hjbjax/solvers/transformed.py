@@ -27,7 +27,6 @@ from hjbjax.iteration.bellman import Greedy
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method
-from hjbjax.markov_chain import memory
 from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.host_calls import call_on_host
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
@@ -37,7 +36,7 @@ from hjbjax.problem.types import Nodes, Number
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, keeping_warnings
-from hjbjax.solvers import host_loop
+from hjbjax.solvers import host_loop, memory
 from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
 from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain, finish_arcs

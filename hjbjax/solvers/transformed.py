@@ -21,8 +21,7 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.iteration import adjoint, arc_adjoint
-from hjbjax.iteration.arc_adjoint import ArcEquation
+from hjbjax.iteration import adjoint
 from hjbjax.iteration.bellman import Greedy
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
@@ -33,6 +32,8 @@ from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Nodes, Number
+from hjbjax.semi_lagrangian import arc_adjoint
+from hjbjax.semi_lagrangian.arc_adjoint import ArcEquation
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, keeping_warnings

@@ -25,7 +25,7 @@ from hjbjax.problem.types import Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import warn
 from hjbjax.tracing import checks
-from hjbjax.well_posedness import attainability, resting
+from hjbjax.well_posedness import attainability, endless_costs, resting
 from hjbjax.well_posedness.attainability import Reach
 
 OPERATIONS = 10_000  # scalar operations per evaluation; XLA takes minutes to compile a dozen such evaluations
@@ -267,7 +267,7 @@ def prepare_on_host(
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
     held = np.asarray(task.obstacles.fixed)
     undiscounted = problem.discount == 0
-    checks.ill_posed(problem, bool(assumptions.may_rest and held.any()), grid)
+    endless_costs.ill_posed(problem, bool(assumptions.may_rest and held.any()), grid)
     # a game is searched only if it fails, because all pairs of actions are expensive; a constraint makes all values
     # finite
     if problem.is_game or is_constrained(problem) or not held.any():

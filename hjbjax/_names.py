@@ -10,10 +10,7 @@ from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, from_hj_reachability, reach, reach_avoid
-from hjbjax.applications.resources import estimate
-from hjbjax.cli.compile_cache import keep_compiled
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
-from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
 from hjbjax.feedback.feedback import greedy_feedback
@@ -30,12 +27,15 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.stretching import Sinh
+from hjbjax.semi_lagrangian.scheme import SemiLagrangian
 from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.files import FileError
 from hjbjax.solution.solution import Solution, SolveError, load
 from hjbjax.solution.status import SolveWarning, Status
 from hjbjax.solvers.batch import solve_batch
+from hjbjax.solvers.compile_cache import keep_compiled
 from hjbjax.solvers.finite_horizon import march
+from hjbjax.solvers.resources import estimate
 from hjbjax.solvers.stationary import solve
 from hjbjax.tracing.interpreter import FallbackWarning
 

@@ -29,9 +29,8 @@ from benchmarks.harness.timing import interleaved
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import fastest_rate
 from hjbjax.iteration import bellman, fixed_point
-from hjbjax.markov_chain import memory
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import stationary_run
+from hjbjax.solvers import memory, stationary_run
 from hjbjax.solvers.setup import prepare_on_host
 
 COLUMNS = (

@@ -21,7 +21,6 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind, check_slopes
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.iteration.methods import ValueIteration
-from hjbjax.markov_chain import attainability, memory, node_checks
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -29,10 +28,12 @@ from hjbjax.problem.pytree import as_partial, front_door, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import keeping_warnings
+from hjbjax.solvers import memory
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import check_arguments, solve
 from hjbjax.tracing import checks
 from hjbjax.tracing.interpreter import FallbackWarning
+from hjbjax.well_posedness import attainability, node_checks
 
 TOL = 1e-6  # the default 1e-3 of ``solve`` would show in the third digit of a probability
 

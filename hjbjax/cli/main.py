@@ -109,7 +109,8 @@ def solve(
 ) -> None:
     """Solve the ready problem NAME; write solution.npz, value.png, policy.png and trajectory.png."""
     entry = catalogue()[name]
-    from hjbjax.cli import compile_cache, run_folder
+    from hjbjax.cli import run_folder
+    from hjbjax.solvers import compile_cache
 
     processes_of.arrive()
     parameters = parameters_of(entry, settings)
@@ -262,7 +263,7 @@ def _one_line_warnings() -> Iterator[None]:
 
     JAX repeats a fault of its cache for every program. Only the first of them is shown.
     """
-    from hjbjax.cli import compile_cache
+    from hjbjax.solvers import compile_cache
 
     faults: set[str] = set()
 
@@ -386,8 +387,9 @@ def gallery(out: Path, only: tuple[str, ...], force: bool, no_cache: bool) -> No
     """Solve every ready problem on a small grid and write one page with plots, numbers and errors."""
     known = catalogue()
     check_jax()
-    from hjbjax.cli import compile_cache, run_folder
     from hjbjax.cli import gallery as pages
+    from hjbjax.cli import run_folder
+    from hjbjax.solvers import compile_cache
 
     with _one_line_error(OSError, 2, "--out: "):
         pages.check_page_folder(out, force)

@@ -2,6 +2,6 @@
 
 Read ``discretisation`` for a problem on a grid, ``schemes`` for the available schemes, ``stencil`` and ``slopes`` for
 differences, ``players`` for the dependence of H on each player, ``cut_cells`` for targets between nodes, ``rates`` and
-``edges`` for the Markov chain and its behaviour at the ends of the box, ``semi_lagrangian`` and ``arcs`` for paths
+``edges`` for the Markov chain and its behaviour at the ends of the box. ``paths`` is the base class of schemes' paths
 across many cells. ``correlated_noise`` checks correlated noise against the spacings.
 """

@@ -55,7 +55,7 @@ would represent only part of the drift, and the solve is refused. The class must
 are cached by it. Its methods are traced, so they must not branch on numbers. Under ``jit``, ``vmap`` and ``grad`` a
 solve requires a monotone scheme, and does not check values.
 
-For a scheme that follows paths over many cells instead of using slopes, see ``semi_lagrangian``.
+For a scheme that follows paths over many cells instead of using slopes, see ``hjbjax.semi_lagrangian``.
 
 All schemes treat walls in the same way. A wall is on a node, whose cell is half a cell. With noise a, outward drift n
 (f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is

@@ -3,5 +3,4 @@
 - ``simulation``: ``simulate``; ``closed_loop`` integrates the loop, ``loop`` evaluates it at one state.
 - ``feedback``: the control between the nodes; ``path``: the result; ``payments``: its cost compared with V.
 - ``safety_filter``: a control that keeps the state in a tube; ``dissipation``: energies along paths.
-- ``output_feedback``: the loop through an observer, if the state is not measured.
 """

@@ -5,11 +5,10 @@
 Read ``observers`` first: the extended Kalman filter, the Luenberger observer, and how to write an observer. Then read
 ``information_state`` for the law of the state on a grid, ``robust_filter`` for the worst-case filter (its equation is
 in ``max_plus``), ``beliefs`` and ``hidden_chain`` for hidden Markov chains, and ``controllers`` for controllers that
-act on these information states. The closed loop is in ``hjbjax.feedback.output_feedback``.
+act on these information states. ``measurement`` describes the sensor, ``output_loop`` evaluates the closed loop at one
+state, and ``output_feedback`` simulates it.
 """
 
-from hjbjax.feedback.output_feedback import simulate_output
-from hjbjax.feedback.output_loop import OutputPath
 from hjbjax.filtering.beliefs import BeliefCoordinates, BeliefProblem, belief_problem
 from hjbjax.filtering.controllers import averaged_hamiltonian, certainty_equivalence, minimum_stress
 from hjbjax.filtering.grid_filter import Density, GridFilter
@@ -17,6 +16,8 @@ from hjbjax.filtering.hidden_chain import HiddenPath, WonhamFilter, simulate_hid
 from hjbjax.filtering.information_state import InformationState, zakai
 from hjbjax.filtering.max_plus import sup_pairing
 from hjbjax.filtering.observers import ExtendedKalman, Gaussian, Luenberger, Observer
+from hjbjax.filtering.output_feedback import simulate_output
+from hjbjax.filtering.output_loop import OutputPath
 from hjbjax.filtering.robust_filter import RobustGridFilter, RobustState, robust_filter
 
 __all__ = [

@@ -25,9 +25,9 @@ import numpy as np
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.feedback.feedback import GridFeedback, is_grid_feedback, lookups
-from hjbjax.feedback.output_loop import Observer, OutputPath
 from hjbjax.filtering.grid_filter import Density, GridFilter, at_ends, check_within, states_of
 from hjbjax.filtering.max_plus import refined_maximum
+from hjbjax.filtering.output_loop import Observer, OutputPath
 from hjbjax.filtering.robust_filter import RobustGridFilter
 from hjbjax.hamiltonian import pointwise
 from hjbjax.problem.grid import Grid

@@ -5,11 +5,11 @@ A step of length dt of the Duncan–Mortensen–Zakai equation is split symmetri
     q ← e^{ℓ/2} q,    q ← e^{𝓛* dt} q,    q ← e^{ℓ/2} q,    ℓ = hᵀR⁻¹dy − ½ hᵀR⁻¹h dt.
 
 The factors are exact for a state that does not move. The middle step conserves mass and keeps q ≥ 0 for any dt and any
-record, see ``forward_equation``. The splitting has order 2 in dt along a smooth record. The likelihood of a noisy
-record has order 1, because an increment does not show when within its interval the noise arrived. In space the order
-is 2 where the law is smooth, by central differences or a limited flux, see ``transport``. The factors are multiplied as
-logarithms after subtracting the largest product, so nothing overflows or vanishes. The subtracted logarithms add up to
-the log-likelihood.
+record, see ``markov_chain.forward_equation``. The splitting has order 2 in dt along a smooth record. The likelihood of
+a noisy record has order 1, because an increment does not show when within its interval the noise arrived. In space the
+order is 2 where the law is smooth, by central differences or a limited flux, see ``markov_chain.transport``. The
+factors are multiplied as logarithms after subtracting the largest product, so nothing overflows or vanishes. The
+subtracted logarithms add up to the log-likelihood.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,10 +23,11 @@ from hjbjax.discretisation import correlated_noise
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.feedback.measurement import Measurement, check_step, measurement, plant, sample_of
-from hjbjax.filtering import forward_equation, resolution, transport
-from hjbjax.filtering.forward_equation import advanced, cells
+from hjbjax.filtering import resolution
+from hjbjax.filtering.measurement import Measurement, check_step, measurement, plant, sample_of
+from hjbjax.markov_chain import forward_equation, transport
 from hjbjax.markov_chain.decision_process import refuse
+from hjbjax.markov_chain.forward_equation import advanced, cells
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -92,7 +93,7 @@ class GridFilter:
     prior: Any  # the density at t = 0, (*grid)
     volumes: Any  # of the nodes, (*grid)
     cells: Any  # of the chain's law, (*grid)
-    axes: tuple[int, ...]  # where the noise is too small for central differences, see ``transport``
+    axes: tuple[int, ...]  # where the noise is too small for central differences, see ``markov_chain.transport``
 
     @front_door
     def __init__(

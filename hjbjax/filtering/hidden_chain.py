@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.measurement import check_length, check_vector
 from hjbjax.filtering.beliefs import Sensor, chain_functions, check_generator
+from hjbjax.filtering.measurement import check_length, check_vector
 from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_jax, as_partial, cast, front_door, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.settings import own_settings

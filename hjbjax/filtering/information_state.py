@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.measurement import check_length, controls_of, record_of
-from hjbjax.filtering.forward_equation import MOST, substeps
 from hjbjax.filtering.grid_filter import Density, GridFilter, warn_at_ends
+from hjbjax.filtering.measurement import check_length, controls_of, record_of
+from hjbjax.markov_chain.forward_equation import MOST, substeps
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_jax, cast, front_door, is_traced, pytree_dataclass

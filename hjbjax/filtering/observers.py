@@ -31,8 +31,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.measurement import Measurement, check_step, check_vector, measurement, plant, sample_of
-from hjbjax.feedback.output_loop import Observer
+from hjbjax.filtering.measurement import Measurement, check_step, check_vector, measurement, plant, sample_of
+from hjbjax.filtering.output_loop import Observer
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, front_door, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.settings import own_settings

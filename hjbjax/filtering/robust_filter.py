@@ -30,10 +30,10 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Weno5
-from hjbjax.feedback.measurement import Measurement, check_step, controls_of, measurement, record_of, sample_of
 from hjbjax.filtering import robust_arguments
 from hjbjax.filtering.grid_filter import signal, warn_at_ends
 from hjbjax.filtering.max_plus import MOST, MaxPlusMarch, refined_maximum
+from hjbjax.filtering.measurement import Measurement, check_step, controls_of, measurement, record_of, sample_of
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

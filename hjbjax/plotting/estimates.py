@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-    from hjbjax.feedback.output_loop import OutputPath
+    from hjbjax.filtering.output_loop import OutputPath
 
 
 @drawing

@@ -11,8 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import arcs
-from hjbjax.discretisation.arcs import ArcPath
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem.grid import Grid
@@ -20,6 +18,8 @@ from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import is_constrained
 from hjbjax.problem.pytree import cast
 from hjbjax.problem.types import AtNodes, Nodes
+from hjbjax.semi_lagrangian import arcs
+from hjbjax.semi_lagrangian.arcs import ArcPath
 from hjbjax.solution.status import warn
 from hjbjax.tracing import components
 

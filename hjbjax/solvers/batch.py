@@ -30,8 +30,6 @@ from hjbjax.discretisation.posing import without_horizon
 from hjbjax.discretisation.schemes import Upwind, check_slopes
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
-from hjbjax.markov_chain import admissibility, memory, node_checks
-from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem import arguments
 from hjbjax.problem.arguments import as_mesh, shown
 from hjbjax.problem.grid import Grid, check_spacings
@@ -46,7 +44,7 @@ from hjbjax.solution.placement import Path
 from hjbjax.solution.rewards import with_rewards
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
-from hjbjax.solvers import host_loop, vanishing_discounts
+from hjbjax.solvers import host_loop, memory, vanishing_discounts
 from hjbjax.solvers.box_error import with_box_error
 from hjbjax.solvers.coarser_answer import coarser_answer
 from hjbjax.solvers.host_solve import Choices, solve_on_host
@@ -67,6 +65,8 @@ from hjbjax.solvers.stationary import check_arguments, check_limits
 from hjbjax.solvers.stationary_run import LanesRun, stack_lanes, with_obstacles
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
+from hjbjax.well_posedness import admissibility, node_checks
+from hjbjax.well_posedness.attainability import Reach
 
 
 @with_rewards

@@ -34,10 +34,10 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes
-from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import warn
+from hjbjax.solvers import nested_grids
 from hjbjax.solvers.coarse_levels import on_coarser
 from hjbjax.solvers.result import warn_of_cuts
 from hjbjax.solvers.settle import Settled

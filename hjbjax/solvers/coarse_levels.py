@@ -12,8 +12,8 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Nodes
-from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
+from hjbjax.solvers import nested_grids
 from hjbjax.solvers.order import at_order, sharpened, staged
 from hjbjax.solvers.setup import assumptions_of, prepared, stores_links
 from hjbjax.solvers.stationary_run import iterate

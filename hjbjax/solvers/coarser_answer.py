@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import Status
+from hjbjax.solvers import nested_grids
 from hjbjax.solvers.coarse_levels import comparison_grid_of, fill_unreachable, on_coarser
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.stationary_run import iterate

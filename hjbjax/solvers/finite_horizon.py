@@ -21,7 +21,6 @@ from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import check_choice
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
-from hjbjax.markov_chain import admissibility, memory, node_checks
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.layouts import spans_processes
@@ -37,13 +36,14 @@ from hjbjax.solution.placement import Path
 from hjbjax.solution.rewards import with_rewards
 from hjbjax.solution.solution import Solution, SolveError, question
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, march_run, time_probes
+from hjbjax.solvers import host_loop, march_run, memory, time_probes
 from hjbjax.solvers.march_errors import Marched, with_march_errors
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, march_evaluation
 from hjbjax.solvers.stationary import check_node_values
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
+from hjbjax.well_posedness import admissibility, node_checks
 
 ROUNDING = 1e-12  # relative amount by which a kept time may exceed the horizon
 PROBES = 33  # times at which a given step, and constrained ends, are checked for a time-dependent problem

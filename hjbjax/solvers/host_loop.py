@@ -19,7 +19,6 @@ from typing import Any, Protocol, TypeAlias
 import jax
 import numpy as np
 
-from hjbjax.markov_chain import memory
 from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.settings import own_settings
@@ -28,6 +27,7 @@ from hjbjax.solution.checkpoints import Part
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
+from hjbjax.solvers import memory
 
 FIRST_NODES = 20_000  # number of nodes visited in a first chunk, approximately
 CALLBACK = "CpuCallback error"  # first words of JAX's exception for a callback, whatever its type

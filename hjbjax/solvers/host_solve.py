@@ -11,7 +11,6 @@ from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration.methods import Method
-from hjbjax.markov_chain import admissibility, node_checks
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.solution import Solution
@@ -25,6 +24,7 @@ from hjbjax.solvers.second_order import better_of, second_order
 from hjbjax.solvers.semi_lagrangian import Followed
 from hjbjax.solvers.settle import Settled, settle
 from hjbjax.solvers.setup import COARSEST, choose_scheme, prepare_on_host, warn_unreached
+from hjbjax.well_posedness import admissibility, node_checks
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,14 +23,13 @@ from hjbjax.iteration.time_methods import TOL, TimeMethod
 from hjbjax.iteration.time_stepping import March
 from hjbjax.problem.pytree import altered, cast
 from hjbjax.problem.types import Nodes, Number
-from hjbjax.solution import grid_error, nested_grids
 from hjbjax.solution.clock import Clock
-from hjbjax.solution.grid_error import TwoGrids
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers import box_error, march_run, time_probes
+from hjbjax.solvers import box_error, grid_error, march_run, nested_grids, time_probes
 from hjbjax.solvers.box_error import BoxError
 from hjbjax.solvers.coarser_answer import LOSES, OVER, TOO_FEW
+from hjbjax.solvers.grid_error import TwoGrids
 from hjbjax.solvers.result import warn_of_grid
 from hjbjax.solvers.setup import march_evaluation
 

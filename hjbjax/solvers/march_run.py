@@ -10,7 +10,6 @@ from hjbjax.discretisation import correlated_noise, edges
 from hjbjax.hamiltonian import discrete
 from hjbjax.iteration import time_stepping
 from hjbjax.iteration.time_stepping import Front, March
-from hjbjax.markov_chain import node_checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
@@ -21,6 +20,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import WideJit
 from hjbjax.solvers.result import isaacs_gap, warn_of_gap
+from hjbjax.well_posedness import node_checks
 
 CERTIFICATE = "a march has no certificate; halve the spacings and the step to see its error"
 ADVICE = {

@@ -15,19 +15,19 @@ from hjbjax.iteration import certificates, fixed_point
 from hjbjax.iteration.certificates import Certificate, ErrorBound
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.isaacs import isaacs_gap
-from hjbjax.markov_chain import earnings, node_checks
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST, Labels
 from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.types import Field, Nodes, Scalar
-from hjbjax.solution import grid_error
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
+from hjbjax.solvers import grid_error
 from hjbjax.solvers.arrival import warn_of_no_arrival
 from hjbjax.solvers.coarser_answer import CoarserAnswer
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
+from hjbjax.well_posedness import earnings, node_checks
 
 GAP = 0.05  # relative to the actions' influence; if Isaacs' condition holds, upwinding left 0.019 on 21 nodes
 COARSE = 0.1  # fraction of the range of V: a larger grid error is worth a warning ...

@@ -3,9 +3,9 @@
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Scheme
-from hjbjax.solution import grid_error, nested_grids
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import Status
+from hjbjax.solvers import grid_error, nested_grids
 from hjbjax.solvers.coarse_levels import fill_unreachable
 from hjbjax.solvers.coarser_answer import coarser_answer
 from hjbjax.solvers.order import raised

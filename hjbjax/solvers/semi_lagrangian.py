@@ -8,34 +8,35 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import arcs, edges
-from hjbjax.discretisation.arcs import Arcs
+from hjbjax.discretisation import edges
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.paths import Paths, Plan
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.discretisation.semi_lagrangian import SemiLagrangian
-from hjbjax.iteration import arc_iteration, bellman, certificates
-from hjbjax.iteration.arc_iteration import ArcState, ArcTask
+from hjbjax.iteration import bellman, certificates
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Sweeps
 from hjbjax.iteration.methods import Method
 from hjbjax.iteration.progress import HISTORY
-from hjbjax.markov_chain import memory, node_checks
-from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import DType, Mask, Nodes
+from hjbjax.semi_lagrangian import arc_iteration, arcs
+from hjbjax.semi_lagrangian.arc_iteration import ArcState, ArcTask
+from hjbjax.semi_lagrangian.arcs import Arcs
+from hjbjax.semi_lagrangian.scheme import SemiLagrangian
 from hjbjax.solution.clock import CUT, Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop
+from hjbjax.solvers import host_loop, memory
 from hjbjax.solvers.host_loop import FIRST_NODES, WideJit
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
 from hjbjax.solvers.setup import check_on_one_state, is_carried_past, warn_unreached
 from hjbjax.solvers.stationary_run import StatesInChunks
+from hjbjax.well_posedness import node_checks
+from hjbjax.well_posedness.attainability import Reach
 
 REPLACEMENT = SemiLagrangian()  # replaces the chain if this is carried past the target
 REASON = (

@@ -10,7 +10,6 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Krylov
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import PolicyIteration
-from hjbjax.markov_chain import resting
 from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
@@ -18,6 +17,7 @@ from hjbjax.solvers.order import at_order
 from hjbjax.solvers.setup import Assumptions, forced_only, linear_solve
 from hjbjax.solvers.stationary_run import iterate
 from hjbjax.solvers.vanishing_discounts import FURTHER, follow, needs_a_way, warm
+from hjbjax.well_posedness import resting
 
 FAILED = (Status.STALLED, Status.DIVERGED, Status.NONFINITE)
 

@@ -17,8 +17,6 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
-from hjbjax.markov_chain import attainability, resting
-from hjbjax.markov_chain.attainability import Reach
 from hjbjax.problem.grid import Grid, tabulated
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
@@ -27,6 +25,8 @@ from hjbjax.problem.types import Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import warn
 from hjbjax.tracing import checks
+from hjbjax.well_posedness import attainability, endless_costs, resting
+from hjbjax.well_posedness.attainability import Reach
 
 OPERATIONS = 10_000  # scalar operations per evaluation; XLA takes minutes to compile a dozen such evaluations
 DIRECT = 50_000  # largest plane grid with open ends that is solved by sparse LU, at about a second per step
@@ -267,7 +267,7 @@ def prepare_on_host(
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
     held = np.asarray(task.obstacles.fixed)
     undiscounted = problem.discount == 0
-    checks.ill_posed(problem, bool(assumptions.may_rest and held.any()), grid)
+    endless_costs.ill_posed(problem, bool(assumptions.may_rest and held.any()), grid)
     # a game is searched only if it fails, because all pairs of actions are expensive; a constraint makes all values
     # finite
     if problem.is_game or is_constrained(problem) or not held.any():

@@ -15,7 +15,6 @@ from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.posing import without_horizon
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.methods import Method, check_method
-from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.layouts import spans_processes
@@ -23,14 +22,14 @@ from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import as_one_program, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Nodes, Number
-from hjbjax.solution import checkpoints, nested_grids
+from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.placement import Path
 from hjbjax.solution.rewards import with_rewards
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
-from hjbjax.solvers import host_loop, semi_lagrangian, transformed
+from hjbjax.solvers import host_loop, memory, nested_grids, semi_lagrangian, transformed
 from hjbjax.solvers.host_solve import Choices, solve_on_host
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, choose

@@ -21,23 +21,23 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.schemes import Limited, Upwind
-from hjbjax.iteration import adjoint, arc_adjoint
-from hjbjax.iteration.arc_adjoint import ArcEquation
+from hjbjax.iteration import adjoint
 from hjbjax.iteration.bellman import Greedy
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method
-from hjbjax.markov_chain import memory
 from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.host_calls import call_on_host
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Nodes, Number
+from hjbjax.semi_lagrangian import arc_adjoint
+from hjbjax.semi_lagrangian.arc_adjoint import ArcEquation
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, keeping_warnings
-from hjbjax.solvers import host_loop
+from hjbjax.solvers import host_loop, memory
 from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
 from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain, finish_arcs

@@ -14,11 +14,12 @@ from click.testing import CliRunner
 
 import hjbjax
 from hjbjax import zoo
-from hjbjax.cli import compile_cache, run_folder
+from hjbjax.cli import run_folder
 from hjbjax.cli.main import main
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.solution import files, placement
 from hjbjax.solution.solution import Solution, Status, load
+from hjbjax.solvers import compile_cache
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

@@ -18,12 +18,13 @@ from click.testing import CliRunner
 
 import hjbjax
 from hjbjax import zoo
-from hjbjax.cli import compile_cache, doctor, gallery, interrupts, run_folder
+from hjbjax.cli import doctor, gallery, interrupts, run_folder
 from hjbjax.cli import main as cli
 from hjbjax.cli.gallery import Card
 from hjbjax.cli.main import main
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, Status, load
+from hjbjax.solvers import compile_cache
 
 posix = pytest.mark.skipif(os.name != "posix", reason="descriptors and signals are POSIX's")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(hjbjax.__file__).parents[1])}

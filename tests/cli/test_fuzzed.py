@@ -8,11 +8,11 @@ from click.testing import CliRunner
 
 import hjbjax
 from hjbjax import zoo
-from hjbjax.applications.resources import Estimate
 from hjbjax.cli import run_folder
 from hjbjax.cli.main import main
-from hjbjax.markov_chain import memory
 from hjbjax.solution.solution import Solution, Status
+from hjbjax.solvers import memory
+from hjbjax.solvers.resources import Estimate
 
 LINES = 2_000
 NAMES = [*zoo.catalogue, "pendulm", "", "Pendulum", "../pendulum", "pendulum\0", "--", "é" * 40]

@@ -12,10 +12,10 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from systems import SEEDS, random_grid, random_problem
 
-from hjbjax.filtering import forward_equation, grid_filter
+from hjbjax.filtering import grid_filter
 from hjbjax.filtering.information_state import GridFilter, zakai
 from hjbjax.filtering.observers import Observer
-from hjbjax.markov_chain import chain
+from hjbjax.markov_chain import chain, forward_equation
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast

@@ -17,13 +17,13 @@ import hjbjax as hjb
 from hjbjax.applications import convergence, hinf, perturbations
 from hjbjax.extremals import collocation, continuation, equilibria
 from hjbjax.feedback import simulation
-from hjbjax.markov_chain import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.solution import clock as clock_module
 from hjbjax.solution.clock import Clock, Stopped, interruptible, noting_interrupts
 from hjbjax.solvers import batch, host_loop, march_run, stationary_run
 from hjbjax.solvers.march_run import MarchRun
 from hjbjax.solvers.stationary_run import LanesRun, StationaryRun
+from hjbjax.well_posedness import node_checks
 
 U = hjb.Box([-1.0], [1.0])
 GRID = hjb.Grid([-1.0], [1.0], (25,))

@@ -70,7 +70,7 @@ def test_more_nodes_than_indices_are_refused(door, grid):
 
 @pytest.mark.parametrize("grid", GRIDS, ids=lambda grid: f"{grid.ndim}-D")
 def test_an_estimate_says_that_they_cannot_be_numbered(grid, monkeypatch):
-    monkeypatch.setattr(hjb.applications.resources.memory, "available", lambda: 10**40)
+    monkeypatch.setattr(hjb.solvers.resources.memory, "available", lambda: 10**40)
     found = hjb.estimate(posed(), grid, measure=False)
     assert not found.numbered
     assert not found.fits
@@ -92,7 +92,7 @@ def test_a_dry_run_of_such_a_grid_ends_with_six(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("scheme", [None, hjb.Upwind(), hjb.SemiLagrangian()], ids=str)
 def test_what_does_not_fit_is_refused_before_the_nodes_are_looked_at(scheme, monkeypatch):
-    from hjbjax.markov_chain import node_checks
+    from hjbjax.well_posedness import node_checks
 
     monkeypatch.setattr(node_checks, "check_values", None)
     grid = hjb.Grid([-1.0] * 2, [1.0] * 2, (40_000, 40_001))

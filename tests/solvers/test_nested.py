@@ -10,9 +10,8 @@ import pytest
 import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.solution import nested_grids
 from hjbjax.solution.clock import Clock
-from hjbjax.solvers import coarse_levels
+from hjbjax.solvers import coarse_levels, nested_grids
 from hjbjax.solvers.setup import prepare_on_host
 
 METHOD = hjb.PolicyIteration(hjb.Sweeps())

@@ -10,9 +10,8 @@ import pytest
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point, time_stepping
-from hjbjax.markov_chain import memory
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import finite_horizon, march_run, setup, stationary_run
+from hjbjax.solvers import finite_horizon, march_run, memory, setup, stationary_run
 
 pytestmark = pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")  # coarse grids, drift that is cut off
 U = hjb.Box([-1.0], [1.0])

@@ -6,8 +6,8 @@ import pytest
 from hjbjax import Box, Grid, Problem
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.markov_chain import node_checks
 from hjbjax.tracing import checks
+from hjbjax.well_posedness import node_checks
 
 GRID = Grid([-1.0, -2.0], [1.0, 2.0], (5, 9))
 U = Box([-1.0], [1.0])

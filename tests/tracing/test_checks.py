@@ -127,27 +127,3 @@ def test_a_scheme_says_how_many_points_it_needs():
 
 def test_shapes_needs_no_memory():
     checks.shapes(Problem(lambda x, u: -x, controls=U), Grid([0.0] * 5, [1.0] * 5, (200,) * 5), Upwind())
-
-
-# --- without discount ---
-
-
-def test_an_endless_cost_is_refused_with_what_would_end_it():
-    with pytest.raises(ValueError, match="no finite solution: discount = 0") as caught:
-        checks.ill_posed(Problem(drift, controls=U), has_rest=False, grid=GRID)
-    message = str(caught.value)
-    assert "discount > 0" in message
-    assert "target" in message
-    assert "rest point" in message
-    assert len(message.splitlines()) <= 6
-
-
-@pytest.mark.parametrize(
-    ("ingredients", "has_rest"),
-    [
-        *(({"discount": 0.1}, False), ({"target": in_disc}, False), ({"stopping_cost": 1.0}, False)),
-        *(({"running_max": in_disc}, False), ({}, True)),
-    ],
-)
-def test_what_ends_an_endless_cost(ingredients, has_rest):
-    checks.ill_posed(Problem(drift, controls=U, **ingredients), has_rest=has_rest, grid=GRID)

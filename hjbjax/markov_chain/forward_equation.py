@@ -29,7 +29,7 @@ import numpy as np
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
-from hjbjax.filtering.transport import Correction, corrections, gained
+from hjbjax.markov_chain.transport import Correction, corrections, gained
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import known
 from hjbjax.problem.types import Array, Control, Field, Number, State

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.solution import nested_grids
+from hjbjax.solvers import nested_grids
 
 
 def test_nodes_that_both_grids_have_keep_their_bits():

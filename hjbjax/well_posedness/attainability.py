@@ -19,11 +19,11 @@ from hjbjax.discretisation import edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian.search import Action
-from hjbjax.markov_chain import tried_actions
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Array, Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
+from hjbjax.well_posedness import tried_actions
 
 FEW = 9  # actions per player in a game, where all pairs are tried
 WINDING = 30  # rounds of sweeps before a graph search takes over; each round follows paths around one more corner

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import Rates
-from hjbjax.markov_chain import attainability, chain, tried_actions
+from hjbjax.markov_chain import chain
 from hjbjax.solution.clock import Clock
+from hjbjax.well_posedness import attainability, tried_actions
 
 MOVES = np.array([[-1.0], [0.0], [1.0]])
 GRID = hjb.Grid([0.0], [7.0], (8,))

@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation.arcs import Arcs, widened
 from hjbjax.discretisation.rates import Rates
 from hjbjax.iteration import certificates, progress
 from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
@@ -30,6 +29,7 @@ from hjbjax.iteration.progress import Progress, keep_finite
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import AtNodes, Field, Mask, Nodes, Number, Scalar
+from hjbjax.semi_lagrangian.arcs import Arcs, widened
 from hjbjax.solution.status import Status
 
 

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.solution import nested_grids
+from hjbjax.solvers import nested_grids
 
 LEAST, FIRST, SECOND = 0.5, 1.0, 2.0  # orders
 # ratio of the change between grids to the change between schemes at which the order is 2 or 1, or the schemes coincide.

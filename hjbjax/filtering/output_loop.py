@@ -7,7 +7,7 @@ Between updates the plant makes sub-steps τ with Platen's predictor–corrector
     x̃ = x + f(x) τ + σ(x) Δw,    x ← x + ½ (f(x) + f(x̃)) τ + σ(x) Δw,
 
 which has weak order 1, and order 2 without noise. The trapezoidal rule at the same points integrates dy and the running
-cost. With noise a target can also be met within a sub-step, see ``loop``.
+cost. With noise a target can also be met within a sub-step, see ``hjbjax.feedback.loop``.
 """
 
 import functools
@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.feedback.loop import BridgeDraw, Loop, meeting_flag, onto_edge
-from hjbjax.feedback.measurement import Measurement
 from hjbjax.feedback.path import PathStatus
+from hjbjax.filtering.measurement import Measurement
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, State

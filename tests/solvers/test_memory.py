@@ -14,10 +14,9 @@ import pytest
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import fixed_point
-from hjbjax.markov_chain import memory
 from hjbjax.problem.arguments import INDEXABLE
 from hjbjax.problem.pytree import cast
-from hjbjax.solvers import stationary_run
+from hjbjax.solvers import memory, stationary_run
 from hjbjax.solvers.setup import assumptions_of, prepare
 
 METHODS = [
@@ -174,7 +173,7 @@ def test_a_limit_on_the_address_space_refuses_a_grid():
     program = """
 import resource
 import hjbjax as hjb
-from hjbjax.markov_chain import memory
+from hjbjax.solvers import memory
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 memory.available()  # starts JAX
 resource.setrlimit(resource.RLIMIT_AS, (used + 4 * 10**9,) * 2)

@@ -9,8 +9,9 @@ import numpy as np
 
 from hjbjax.feedback.feedback import GridFeedback, check_kept, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop
-from hjbjax.feedback.measurement import Measurement, measurement
-from hjbjax.feedback.output_loop import (
+from hjbjax.feedback.path import PathStatus
+from hjbjax.filtering.measurement import Measurement, measurement
+from hjbjax.filtering.output_loop import (
     CertaintyEquivalence,
     Observer,
     OutputLoop,
@@ -19,7 +20,6 @@ from hjbjax.feedback.output_loop import (
     of_information,
     output_path,
 )
-from hjbjax.feedback.path import PathStatus
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem

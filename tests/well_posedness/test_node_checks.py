@@ -11,8 +11,8 @@ from hjbjax import Box, Finite, Grid, Problem
 from hjbjax.discretisation import correlated_noise, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.markov_chain import node_checks
 from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.well_posedness import node_checks
 
 
 @pytest.mark.parametrize(

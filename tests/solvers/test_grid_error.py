@@ -6,8 +6,8 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import Grid
-from hjbjax.solution import grid_error
-from hjbjax.solution.grid_error import TwoGrids
+from hjbjax.solvers import grid_error
+from hjbjax.solvers.grid_error import TwoGrids
 
 FINE, COARSE = Grid([-1.0] * 2, [1.0] * 2, (41, 41)), Grid([-1.0] * 2, [1.0] * 2, (21, 21))
 X = np.stack(np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41), indexing="ij"), -1)

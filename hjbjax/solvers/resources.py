@@ -8,7 +8,6 @@ import numpy as np
 from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.methods import Method, Nested
-from hjbjax.markov_chain import memory
 from hjbjax.problem import arguments
 from hjbjax.problem.arguments import INDEXABLE
 from hjbjax.problem.grid import Grid
@@ -21,7 +20,7 @@ from hjbjax.problem.time_change import in_own_time
 from hjbjax.problem.types import DType
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
-from hjbjax.solvers import semi_lagrangian
+from hjbjax.solvers import memory, semi_lagrangian
 from hjbjax.solvers.coarse_levels import below
 from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.stationary import check_arguments, solve

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hjbjax.filtering import forward_equation
 from hjbjax.filtering.information_state import GridFilter, zakai
 from hjbjax.filtering.observers import ExtendedKalman
+from hjbjax.markov_chain import forward_equation
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 

@@ -16,8 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import arcs
-from hjbjax.discretisation.arcs import Arcs, widened
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.paths import Plan
 from hjbjax.hamiltonian.derivatives import once
@@ -26,6 +24,8 @@ from hjbjax.iteration.adjoint import Map, solve_in_stages
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import AtNodes, Field, Mask, Scalar
+from hjbjax.semi_lagrangian import arcs
+from hjbjax.semi_lagrangian.arcs import Arcs, widened
 
 FOLLOWED = 32  # arcs followed between two evaluations of the residual
 

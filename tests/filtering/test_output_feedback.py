@@ -9,10 +9,10 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
 import hjbjax as hjb
-from hjbjax.feedback.output_feedback import simulate_output
 from hjbjax.feedback.path import PathStatus
 from hjbjax.filtering.information_state import GridFilter, zakai
 from hjbjax.filtering.observers import ExtendedKalman, Luenberger
+from hjbjax.filtering.output_feedback import simulate_output
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass

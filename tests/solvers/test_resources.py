@@ -7,8 +7,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.applications import resources
-from hjbjax.markov_chain import memory
+from hjbjax.solvers import memory, resources
 
 
 def test_bytes_alone_cost_nothing_whatever_the_size():

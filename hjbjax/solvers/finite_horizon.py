@@ -4,6 +4,7 @@ At host level it validates the arguments, computes the longest stable step, step
 second from one kept time to the next, and reports. Under a tracer the same steps run in a scan of fixed length.
 """
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -149,8 +150,7 @@ def march(
         on = Discretisation(problem, grid, scheme, arguments.traced_dtype(dtype, "march"))
         return _march_traced(on, horizon, kept, start, method, step, inner, throw)
     kind = arguments.as_dtype(dtype)
-    if np.any(np.diff(kept.astype(kind)) <= 0):
-        raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; remove one")
+    _check_distinct(kept, kind)
     check_node_values(start, grid, "march: start")
     check_spacings(grid, kind)
     clock = Clock(seconds=time_limit, progress=progress, together=spans_processes(mesh))
@@ -169,19 +169,10 @@ def march(
         # within a second: errors visible at a single state, and a grid that does not fit
         check_on_one_state(problem, grid, scheme)
         on = Discretisation(problem, grid, scheme, kind)
+        asked = _Asked(on, horizon, kept, start, method, step, inner, policy, mesh)
         needed = memory.fitting(memory.of_march(on, len(kept), method, policy=policy), grid, max_memory)
-        with host_loop.with_solution(
-            clock, needed, lambda _: _solution_at_horizon(on, horizon, start, Status.INTERRUPTED)
-        ):
-            try:
-                task, solution = _on_host(
-                    on, horizon, kept, start, method, step, inner, clock, policy=policy, mesh=mesh
-                )
-                if solution.status is Status.CONVERGED:
-                    marched = Marched(task, method, start, int(solution.steps))
-                    solution = with_march_errors(solution, marched, clock)
-            except Stopped as stop:
-                solution = _solution_at_horizon(on, horizon, start, stop.status)
+        with host_loop.with_solution(clock, needed, lambda _: _solution_at_horizon(asked, Status.INTERRUPTED)):
+            solution = _with_estimates(asked, clock)
         solution = with_last_phase(solution, clock)
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon,
@@ -215,35 +206,51 @@ def march_part(
     with noting_interrupts(clock), host_loop.announce(clock), own_settings(x64=True):
         check_on_one_state(problem, grid, scheme)
         on = Discretisation(problem, grid, scheme, np.dtype(np.float64))
+        asked = _Asked(on, horizon, kept, start, method, step=None, inner=inner, policy=True)
         memory.fitting(memory.of_march(on, len(kept), method, policy=True), grid, None)
         try:
-            _, solution = _on_host(on, horizon, kept, start, method, None, inner, clock, policy=True)
+            _, solution = _on_host(asked, clock)
         except Stopped as stop:
-            solution = _solution_at_horizon(on, horizon, start, stop.status)
+            solution = _solution_at_horizon(asked, stop.status)
         return with_last_phase(solution, clock)
 
 
-def _on_host(
-    on: Discretisation,
-    horizon: float,
-    kept: np.ndarray,
-    start: Nodes | None,
-    method: TimeMethod,
-    step: float | None,
-    inner: float | None,
-    clock: Clock,
-    *,
-    policy: bool,
-    mesh: Mesh | None = None,
-) -> tuple[March, Solution]:
+@dataclasses.dataclass(frozen=True)
+class _Asked:
+    """A march at host level, with checked arguments; see ``march``."""
+
+    on: Discretisation
+    horizon: float
+    kept: np.ndarray
+    start: Nodes | None
+    method: TimeMethod
+    step: float | None
+    inner: float | None
+    policy: bool
+    mesh: Mesh | None = None
+
+
+def _with_estimates(asked: _Asked, clock: Clock) -> Solution:
+    """The solution of a march as far as the clock allows, with estimates of its errors if it reaches t = 0."""
+    try:
+        task, solution = _on_host(asked, clock)
+        if solution.status is not Status.CONVERGED:
+            return solution
+        return with_march_errors(solution, Marched(task, asked.method, asked.start, int(solution.steps)), clock)
+    except Stopped as stop:
+        return _solution_at_horizon(asked, stop.status)
+
+
+def _on_host(asked: _Asked, clock: Clock) -> tuple[March, Solution]:
     """The task of a march, and its solution as far as the clock allows.
 
     Raises:
       Stopped: the clock stopped the march before the first step.
     """
+    on, horizon = asked.on, asked.horizon
     _check_nodes(on, horizon, clock)
-    task = _prepare(on, horizon, method, step, inner, policy=policy, mesh=mesh)
-    slices, front, code = march_run.drive_march(task, horizon, kept, start, clock)
+    task = _prepare(on, horizon, asked.method, asked.step, asked.inner, policy=asked.policy, mesh=asked.mesh)
+    slices, front, code = march_run.drive_march(task, horizon, asked.kept, asked.start, clock)
     return task, march_run.assemble(task, on.grid, slices, front, code)
 
 
@@ -257,8 +264,9 @@ def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:
     clock.enter("the preparation")
 
 
-def _solution_at_horizon(on: Discretisation, horizon: float, start: Nodes | None, code: Status) -> Solution:
+def _solution_at_horizon(asked: _Asked, code: Status) -> Solution:
     """The solution of a march that ended before its first step: its initial value; NaN if unknown."""
+    on, horizon, start = asked.on, asked.horizon, asked.start
     value = np.full((1, *on.grid.shape), np.nan if start is None else np.asarray(start), on.dtype)
     message = f"The march did not leave t = {horizon:g}. {on.problem.labels.word(march_run.ADVICE[code])}"
     return altered(solution_at_start(on, value, code), times=np.array([horizon]), message=message)
@@ -300,6 +308,12 @@ def _times(horizon: float, times: Sequence[float] | Array | None) -> tuple[float
     if kept[0] < 0 or kept[-1] > horizon:
         raise ValueError(f"march: times run from {kept[0]:g} to {kept[-1]:g}; wanted them in [0, {horizon:g}]")
     return float(horizon), kept
+
+
+def _check_distinct(kept: np.ndarray, kind: np.dtype) -> None:
+    """Refuse kept times that are the same number in the precision of the march."""
+    if np.any(np.diff(kept.astype(kind)) <= 0):
+        raise ValueError(f"march: two of the times {kept.tolist()} are the same number in {kind}; remove one")
 
 
 def _without_moving_target(problem: Problem) -> Problem:

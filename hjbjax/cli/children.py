@@ -120,7 +120,7 @@ def followed(module: str, words: Sequence[str], environment: Mapping[str, str]) 
     return Command([sys.executable, "-P", __file__, module, *words], {**environment, "PYTHONPATH": path})
 
 
-def run(
+def run_children(
     commands: Sequence[Command],
     explained: Collection[int] = (),
     muted: Collection[bytes] = (),

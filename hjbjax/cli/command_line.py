@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 
@@ -17,7 +17,7 @@ from hjbjax.problem import streams
 if TYPE_CHECKING:
     from hjbjax.zoo.entry import Entry
 
-
+N = TypeVar("N", int, float)
 UNREAD = 141  # 128 + SIGPIPE, by convention of shells the exit code of a program whose reader has closed the pipe
 
 
@@ -204,11 +204,7 @@ class Name(click.ParamType):
         return word
 
 
-@overload
-def finite(text: str, kind: type[int]) -> int | None: ...
-@overload
-def finite(text: str, kind: type[float]) -> float | None: ...
-def finite(text: str, kind: type[float]) -> float | None:
+def finite(text: str, kind: type[N]) -> N | None:
     """Parse ``text`` as a finite number of the given kind; ``None`` if it is not one."""
     try:
         number = kind(text)

@@ -243,7 +243,7 @@ def start_processes(words: Sequence[str], processes: int, heartbeat: int, result
             ]
             arrival = (ARRIVED.encode(), ARRIVAL + processes)
             # less than the heartbeat, so that the others can save their work even if the stopped one continues
-            outcome = children.run(commands, EXPLAINED, GREETING, heartbeat / 2, FAREWELL.encode(), arrival)
+            outcome = children.run_children(commands, EXPLAINED, GREETING, heartbeat / 2, FAREWELL.encode(), arrival)
     except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
         raise Failure(f"launch: {processes} processes could not be started: {error}", DIED) from error
     code = _verdict(outcome, _way_on(words, processes, result))

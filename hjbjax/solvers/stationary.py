@@ -200,7 +200,7 @@ def _solve_traced(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | Non
 
     Its derivative is the derivative of the equation that it solves, and is part of the program.
     """
-    return transformed.solve(problem, grid, asked, guess, tol)
+    return transformed.solve_in_program(problem, grid, asked, guess, tol)
 
 
 def check_limits(max_steps: object, time_limit: object) -> None:

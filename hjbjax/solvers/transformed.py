@@ -99,7 +99,7 @@ class Found:
     arc: Any = None
 
 
-def solve(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: Number) -> Solution:
+def solve_in_program(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: Number) -> Solution:
     """The solution, whose value and policy are functions of the numbers in the problem and in the grid."""
     method = choose(problem, grid, traced=True, method=asked.method).inner
     on = Discretisation(problem, grid, asked.scheme or _scheme(problem, method), asked.dtype)

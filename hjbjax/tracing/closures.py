@@ -191,7 +191,9 @@ class Marked:
             return self.__wrapped__(*arguments, **options)
         closed, structure = found
         leaves = [_as_traced(leaf) for leaf in jax.tree.leaves((options, arguments))]
-        return jax.tree.unflatten(structure, host_functions.evaluate(closed.jaxpr, closed.consts, *leaves))
+        return jax.tree.unflatten(
+            structure, host_functions.evaluate_with_host_calls(closed.jaxpr, closed.consts, *leaves)
+        )
 
     def jaxpr(self, options: dict, arguments: tuple) -> tuple[jex.ClosedJaxpr, Any] | None:
         """The jaxpr of the leaves of (options, arguments) and the tree of its results; None without a jaxpr.
@@ -255,7 +257,7 @@ class Opened:
         constants, leaves = known
         # a jaxpr requires the dtypes of its trace, and a solve may have cast the leaves to float32 meanwhile
         closed = self._in_traced_dtypes(constants, self.jaxpr.constvars)
-        return host_functions.evaluate(
+        return host_functions.evaluate_with_host_calls(
             self.jaxpr, closed, *self._in_traced_dtypes((*leaves, *arguments), self.jaxpr.invars)
         )[0]
 

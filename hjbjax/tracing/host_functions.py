@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 NAME = "pure_callback"
 
 
-def evaluate(jaxpr: jex.Jaxpr, consts: Sequence[Numbers], *arguments: Numbers) -> list:
+def evaluate_with_host_calls(jaxpr: jex.Jaxpr, consts: Sequence[Numbers], *arguments: Numbers) -> list:
     """``jax.core.eval_jaxpr``, with host functions that receive and return 64-bit numbers unchanged."""
     if not jaxprs.calls_back(jaxpr):
         return jax.core.eval_jaxpr(jaxpr, consts, *arguments)
@@ -38,7 +38,7 @@ def evaluate(jaxpr: jex.Jaxpr, consts: Sequence[Numbers], *arguments: Numbers) -
 
 
 def is_host_call(eqn: jex.JaxprEqn) -> bool:
-    """True for a call of the host, also as ``evaluate`` makes it."""
+    """True for a call of the host, also as ``evaluate_with_host_calls`` makes it."""
     return NAME in (eqn.primitive.name, eqn.params.get("name"))
 
 
@@ -63,13 +63,13 @@ def _results(eqn: jex.JaxprEqn, operands: list) -> list:
 
 
 def _changed(parameter: Any) -> Any:
-    """A parameter of an equation; jaxprs in it call the host by ``evaluate``."""
+    """A parameter of an equation; jaxprs in it call the host by ``evaluate_with_host_calls``."""
     if type(parameter) is tuple:  # the branches of a ``cond``
         return tuple(map(_changed, parameter))
     if not jaxprs.is_closed(parameter):
         return _changed(jaxprs.closed(parameter)).jaxpr if jaxprs.is_open_jaxpr(parameter) else parameter
     shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type) for aval in parameter.in_avals]
-    return jax.make_jaxpr(functools.partial(evaluate, parameter.jaxpr, parameter.consts))(*shapes)
+    return jax.make_jaxpr(functools.partial(evaluate_with_host_calls, parameter.jaxpr, parameter.consts))(*shapes)
 
 
 class _OnHost:

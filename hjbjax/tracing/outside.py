@@ -62,7 +62,7 @@ def identity(thing: object, depth: int = 8) -> Hashable | None:
         return _identities(thing, depth)
     if isinstance(thing, types.FunctionType):
         return _identity_of_function(thing, depth)
-    if isinstance(thing, Nested):
+    if isinstance(thing, Composite):
         return _identities((thing.function, *thing.inner), depth)
     if dataclasses.is_dataclass(thing) and not jax.tree_util.all_leaves([thing]):
         fields = _identities([getattr(thing, field.name) for field in dataclasses.fields(thing)], depth)
@@ -207,11 +207,11 @@ def _called(callback: object) -> Hashable:
     return function
 
 
-class Nested:
+class Composite:
     """A function whose leading arguments hold other functions, as a function of the numbers in these arguments.
 
     ``Partial(negative, Partial(distance, 0.5))`` is a pytree with ``distance`` in its structure, so two of them are
-    equal only for the same object ``distance``. ``Partial(Nested(negative, distance), ((0.5,), {}))`` is equal to
+    equal only for the same object ``distance``. ``Partial(Composite(negative, distance), ((0.5,), {}))`` is equal to
     another one by what it computes, like any function, and the numbers that ``distance`` reads are found.
 
     Args:
@@ -226,7 +226,7 @@ class Nested:
 
     def __reduce__(self) -> tuple[type, tuple[Callable, Any, tuple[Callable | None, ...]]]:
         """Pickle the functions, because a code object cannot be pickled."""
-        return Nested, (self.function, self.structure, self.inner)
+        return Composite, (self.function, self.structure, self.inner)
 
     def __call__(self, leaves: Sequence[Any], *arguments: Any, **options: Any) -> Any:
         """The outer function's result; a leaf with an inner function is a tuple of its arguments and keywords."""
@@ -244,7 +244,7 @@ def unnested(function: Partial) -> Partial:
     flat = [unnested(leaf) if _is_partial(leaf) else leaf for leaf in leaves]
     inner = [each.func if _is_partial(each) else None for each in flat]
     numbers = [(each.args, each.keywords) if _is_partial(each) else each for each in flat]
-    return Partial(Nested(function.func, structure, inner), tuple(numbers))
+    return Partial(Composite(function.func, structure, inner), tuple(numbers))
 
 
 def _is_partial(thing: object) -> TypeGuard[Partial]:
@@ -277,7 +277,7 @@ class OfNumbers:
     """A function of the numbers that it reads under ``names``, and of its own arguments."""
 
     def __init__(self, function: Callable, names: Sequence[str]):
-        assert isinstance(function, (types.FunctionType, Nested))  # other callables read nothing by name
+        assert isinstance(function, (types.FunctionType, Composite))  # other callables read nothing by name
         self.function, self.names = function, tuple(names)
         self.__code__ = function.__code__  # distinguishes it from others, together with its mark
         own = inspect.signature(function)
@@ -308,9 +308,9 @@ def _reading(function: Any, numbers: dict[str, Any]) -> Any:
             values.setdefault(helper, {})[inner] = number
         else:
             values[name] = number
-    if isinstance(function, Nested):
+    if isinstance(function, Composite):
         outer, *inside = (_reading(each, values[str(i)]) if str(i) in values else each for i, each in _each(function))
-        return Nested(outer, function.structure, inside)
+        return Composite(outer, function.structure, inside)
     read = _read(function)
     values = {n: _reading(read[n], each) if isinstance(each, dict) else each for n, each in values.items()}
     inner_names, cells = function.__code__.co_freevars, function.__closure__ or ()
@@ -329,10 +329,10 @@ def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 6) ->
     """Numbers of these kinds, and real arrays, in the cells and globals that a function's own code names.
 
     Functions in its cells are included, as ``helper.name``: a drift may call a helper defined next to it. The functions
-    of ``Nested`` are called 0, 1, 2 and so on. Rewards and discounts of the state add up to three levels of the
+    of ``Composite`` are called 0, 1, 2 and so on. Rewards and discounts of the state add up to three levels of the
     package's own functions.
     """
-    if isinstance(function, Nested):
+    if isinstance(function, Composite):
         each_read = ((i, numbers_read(each, kinds, depth)) for i, each in _each(function))
         return {f"{i}{INSIDE}{name}": number for i, read in each_read for name, number in read.items()}
     if depth == 0 or not isinstance(function, types.FunctionType) or _writes(function.__code__):
@@ -345,7 +345,7 @@ def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 6) ->
     return dict(sorted(found.items()))
 
 
-def _each(function: Nested) -> Iterable[tuple[int, Any]]:
+def _each(function: Composite) -> Iterable[tuple[int, Any]]:
     """The outer function and the inner ones, with their numbers."""
     return enumerate((function.function, *function.inner))
 

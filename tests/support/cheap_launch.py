@@ -61,7 +61,7 @@ def main():
     print("ready", flush=True)
     try:
         words, seconds = asked.get("arrival", ("", math.inf))
-        outcome = children.run(
+        outcome = children.run_children(
             commands,
             [2, 3, 4, 130],
             [b"[muted]"],

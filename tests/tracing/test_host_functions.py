@@ -41,7 +41,7 @@ FORMS = {
 def test_doubles_are_not_rounded_on_their_way(form):
     with own_settings(x64=True):
         closed = jax.make_jaxpr(FORMS[form])(AT)
-        called = jax.jit(lambda x: host_functions.evaluate(closed.jaxpr, closed.consts, x)[0])
+        called = jax.jit(lambda x: host_functions.evaluate_with_host_calls(closed.jaxpr, closed.consts, x)[0])
         np.testing.assert_array_equal(called(AT), np.sin(AT))
 
 
@@ -67,4 +67,4 @@ def test_results_of_another_type_are_refused():
     with own_settings(x64=True):
         closed = jax.make_jaxpr(function)(AT)
         with pytest.raises(Exception, match="returned float32 numbers, wanted float64"):
-            jax.block_until_ready(host_functions.evaluate(closed.jaxpr, closed.consts, jnp.asarray(AT)))
+            jax.block_until_ready(host_functions.evaluate_with_host_calls(closed.jaxpr, closed.consts, jnp.asarray(AT)))

@@ -118,7 +118,7 @@ def _continued(values: Field, grid: Grid, axis: int, reach: int, noisy: Noisy | 
         first, second, third = (w.reshape(along) * node for w, node in zip(weights, (a, b, c), strict=True))
         found = first + second + third
         if (end := stencil.sloped(grid, axis, step)) is not None:  # the mirror image with the prescribed slope
-            rise = 2 * step * grid.spacing(axis) * (end.slope + getattr(end, "rate", 0.0) * a)
+            rise = 2 * step * grid.spacing(axis) * (end.slope + end.rate * a)
             image = [node + k * rise for k, node in enumerate([b, c, *far][:reach], 1)]
             return jnp.concatenate(image[::-1] if step < 0 else image, axis).astype(values.dtype)
         if noisy is None or step not in noisy[axis]:

@@ -90,7 +90,7 @@ def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
     if (axis, step) in grid.sides("linear"):
         return 2.0, -1.0
     if (end := sloped(grid, axis, step)) is not None:
-        return step * 2 * _last_gap(grid, axis, step) * getattr(end, "rate", 0.0), 1.0
+        return step * 2 * _last_gap(grid, axis, step) * end.rate, 1.0
     if grid.stretch[axis] is None:
         return 3.0, -3.0, 1.0
     gaps = jnp.diff(jnp.asarray(undivided(grid).axis(axis)))

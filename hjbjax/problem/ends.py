@@ -49,6 +49,7 @@ class Neumann:
     """
 
     slope: Any = 0.0
+    rate = 0.0  # not a field: Robin's equation with a rate of zero
     kind = "neumann"
 
 

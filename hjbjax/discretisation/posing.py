@@ -4,7 +4,6 @@ A decorated function receives problems with fixed sets and with discounts that a
 controls and the problem of the user.
 """
 
-import functools
 import inspect
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
@@ -15,6 +14,7 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.problem.arguments import with_calls_by_name
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, cast, is_traced
@@ -23,7 +23,7 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import bounds_at, control_of, in_unit_box, with_any_control
 from hjbjax.problem.time_change import in_own_time, with_killing
 from hjbjax.problem.types import Array, Scalar
-from hjbjax.solution.solution import Solution
+from hjbjax.solution.solution import Solution, change_solutions
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import holds_tracers, settled, settled_function
 
@@ -46,20 +46,13 @@ def with_horizon(function: Callable[P, T]) -> Callable[P, T]:
 
 def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str], Problem]) -> Callable[P, T]:
     """A public function that receives problems that the solvers know."""
-    parameters = inspect.signature(function)
-    first, second = list(parameters.parameters)[:2]
+    first, second = list(inspect.signature(function).parameters)[:2]
 
-    @functools.wraps(function)
-    def called(*arguments: P.args, **options: P.kwargs) -> Any:
-        asked: Any = arguments[0] if arguments else options.get(first)
+    def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
+        asked, grid = given[first], given[second]
         problems = [asked] if isinstance(asked, Problem) else asked if isinstance(asked, list) else []
         if not any(map(_depends_on_state, problems)):
-            return function(*arguments, **options)
-        try:
-            given: dict[str, Any] = dict(parameters.bind(*arguments, **options).arguments)
-        except TypeError:
-            return function(*arguments, **options)  # refuses its arguments
-        grid = given[second]
+            return function(**given)
         if isinstance(grid, Grid):
             made = [
                 discounting(_with_fixed_set(each, grid, function.__name__), grid, function.__name__)
@@ -69,15 +62,15 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
             ]
             given[first] = made[0] if isinstance(asked, Problem) else made
         try:
-            found: Any = function(**given)  # type: ignore[call-arg]
+            found = function(**given)
         except BaseException as error:
-            _restore(error, problems)
+            change_solutions(error, lambda solution, lane: _restored(solution, problems, lane))
             raise
         if isinstance(found, list):
             return [_of_user(*each) for each in zip(found, problems, strict=True)]
         return _of_user(found, problems[0])
 
-    return called
+    return with_calls_by_name(function, call)
 
 
 def _depends_on_state(problem: object) -> bool:
@@ -97,16 +90,11 @@ def _of_user(found: Any, problem: Problem) -> Any:
     return altered(found, **changed)
 
 
-def _restore(error: BaseException, problems: list[Problem]) -> None:
-    """Give the partial solutions of an exception the controls and the problems of the user."""
-    reported: Any = error
-    solution, solutions = getattr(error, "solution", None), getattr(error, "solutions", ())
-    if solutions:
-        restored = tuple(_of_user(*each) for each in zip(solutions, problems, strict=True))
-        reported.solution = next(new for old, new in zip(solutions, restored, strict=True) if old is solution)
-        reported.solutions = restored
-    elif isinstance(solution, Solution) and len(problems) == 1:
-        reported.solution = _of_user(solution, problems[0])
+def _restored(solution: Solution, problems: list[Problem], lane: int | None) -> Solution:
+    """A partial solution with the controls and the problem of the user; unchanged if its problem is not known."""
+    if lane is None and len(problems) > 1:
+        return solution
+    return _of_user(solution, problems[lane or 0])
 
 
 # --- controls ---

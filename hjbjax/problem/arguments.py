@@ -6,9 +6,11 @@ value and the wanted value. Tracers pass, because inside a JAX transformation va
 
 import contextlib
 import difflib
+import functools
+import inspect
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,7 @@ from hjbjax.problem.pytree import is_traced, numbers
 from hjbjax.problem.stretching import Sinh, Stretching
 from hjbjax.problem.types import Array, DType, Key
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 COINCIDING = 16  # units in the last place of a coordinate; every spacing must be larger
@@ -29,6 +32,26 @@ NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state wit
 SHOWN = 80  # characters of a refused value to quote
 EDGES = ("projected", "constrained", "open", "linear")  # ends without numbers: static, hashable, saved as names
 Ends = tuple[str, str] | None  # the kinds of the lower and the upper end of an axis; None for a periodic axis
+
+
+def with_calls_by_name(
+    function: Callable[P, T], call: Callable[[Callable[..., T], dict[str, Any]], Any]
+) -> Callable[P, T]:
+    """The function whose calls become ``call(function, given)``, with all arguments of the call by name in ``given``.
+
+    Arguments that do not fit go to ``function``, which raises Python's TypeError.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def called(*arguments: P.args, **options: P.kwargs) -> Any:
+        try:
+            given = dict(signature.bind(*arguments, **options).arguments)
+        except TypeError:
+            return function(*arguments, **options)
+        return call(function, given)
+
+    return called
 
 
 def positive(value: T, name: str, unit: str = "", *, most: float = math.inf, endless: bool = False) -> T:

@@ -5,7 +5,6 @@ on the way in, and value, bounds and prescribed ends on the way out. The labels 
 a cost or a reward, so functions that use a value, such as ``simulate``, take it with ``in_costs``.
 """
 
-import functools
 import inspect
 from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
@@ -13,12 +12,13 @@ from typing import Any, ParamSpec, TypeVar
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem.arguments import with_calls_by_name
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST, REWARD
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced
 from hjbjax.problem.rewards import costs_of, negative, negative_ends
-from hjbjax.solution.solution import Solution
+from hjbjax.solution.solution import Solution, change_solutions
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -70,30 +70,23 @@ def with_rewards(function: Callable[P, T]) -> Callable[P, T]:
 
     Calls with costs only pass through unchanged.
     """
-    parameters = inspect.signature(function)
-    first, second = list(parameters.parameters)[:2]
+    first, second = list(inspect.signature(function).parameters)[:2]
 
-    @functools.wraps(function)
-    def called(*arguments: P.args, **options: P.kwargs) -> Any:
-        asked: Any = arguments[0] if arguments else options.get(first)
+    def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
+        asked = given[first]
         if not isinstance(asked, Problem) and isinstance(asked, Iterable):
-            asked = list(asked)  # only once, because it may be a generator
-            arguments, options = ((asked, *arguments[1:]), options) if arguments else ((), {**options, first: asked})  # type: ignore[assignment]
+            given[first] = asked = list(asked)  # only once, because it may be a generator
         problems = asked if isinstance(asked, list) else [asked]
         rewarded = [isinstance(each, Problem) and each.payoff == REWARD for each in problems]
         if not any(rewarded):
-            return function(*arguments, **options)
-        try:
-            given: dict[str, Any] = dict(parameters.bind(*arguments, **options).arguments)
-        except TypeError:
-            return function(*arguments, **options)  # refuses its arguments
+            return function(**given)
         grid = given[second]
         if isinstance(grid, Grid):
             _refuse_mixed_ends(function.__name__, grid, all_rewarded=all(rewarded))
             given[second] = negative_ends(grid)
         given |= {name: negative(_as_numbers(given[name])) for name in GUESSES if name in given}
         try:
-            found: Any = function(**given)  # type: ignore[call-arg]
+            found = function(**given)
         except BaseException as error:
             _turn(error, problems, rewarded, grid)
             raise
@@ -101,7 +94,7 @@ def with_rewards(function: Callable[P, T]) -> Callable[P, T]:
             return in_rewards(found, grid, asked)
         return [_turned(*each, grid) for each in zip(found, problems, rewarded, strict=True)]
 
-    return called
+    return with_calls_by_name(function, call)
 
 
 def _turned(solution: Solution, problem: Problem, rewarded: bool, grid: Grid) -> Solution:
@@ -111,14 +104,15 @@ def _turned(solution: Solution, problem: Problem, rewarded: bool, grid: Grid) ->
 
 def _turn(error: BaseException, problems: list[Problem], rewarded: list[bool], grid: Grid) -> None:
     """Give the partial solutions of an exception the sign of the rewards."""
-    reported: Any = error
-    solution, solutions = getattr(error, "solution", None), getattr(error, "solutions", ())
-    if solutions:
-        turned = tuple(_turned(*each, grid) for each in zip(solutions, problems, rewarded, strict=True))
-        reported.solution = next(new for old, new in zip(solutions, turned, strict=True) if old is solution)
-        reported.solutions = turned
-    elif isinstance(solution, Solution) and solution.problem is not None and solution.problem.payoff == REWARD:
-        reported.solution = in_rewards(solution, grid, problems[0] if len(problems) == 1 else solution.problem)
+
+    def turned(solution: Solution, lane: int | None) -> Solution:
+        if lane is not None:
+            return _turned(solution, problems[lane], rewarded[lane], grid)
+        if solution.problem is None or solution.problem.payoff != REWARD:
+            return solution
+        return in_rewards(solution, grid, problems[0] if len(problems) == 1 else solution.problem)
+
+    change_solutions(error, turned)
 
 
 def _as_numbers(values: Any) -> Any:

@@ -7,7 +7,7 @@ affine in the value V, so four numbers store them. The error of V is at most max
 
 import dataclasses
 import html
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -341,6 +341,29 @@ def load(path: Path) -> Solution:
       FileError: the file is missing, truncated, damaged, foreign, of a newer format, or inconsistent.
     """
     return Solution(**files.read(path, archive.FORMAT, archive.VERSION, archive.plan, archive.fields))
+
+
+def attach_solution(error: Exception, solution: Solution | None) -> None:
+    """Make a partial solution the ``.solution`` of an exception of any type, as it is in ``SolveError``."""
+    reported: Any = error
+    reported.solution = solution
+
+
+def change_solutions(error: BaseException, change: Callable[[Solution, int | None], Solution]) -> None:
+    """Replace the partial solutions of an exception in place, so that the traceback stays the same.
+
+    Args:
+      error: any exception; one without partial solutions is left as it is.
+      change: a function of a solution and the number of its lane, which is None outside of a batch.
+    """
+    reported: Any = error
+    solution, solutions = getattr(error, "solution", None), getattr(error, "solutions", ())
+    if solutions:
+        changed = tuple(change(each, lane) for lane, each in enumerate(solutions))
+        reported.solution = next(new for old, new in zip(solutions, changed, strict=True) if old is solution)
+        reported.solutions = changed
+    elif isinstance(solution, Solution):
+        reported.solution = change(solution, None)
 
 
 def question(problem: Problem) -> dict[str, Any]:

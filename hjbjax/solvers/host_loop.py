@@ -25,7 +25,7 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.checkpoints import Part
 from hjbjax.solution.clock import CHUNK_SECONDS, Clock
-from hjbjax.solution.solution import Solution
+from hjbjax.solution.solution import Solution, attach_solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers import memory
 
@@ -229,10 +229,11 @@ def progress_bar(progress: bool | None, options: dict[str, Any]) -> Iterator[Any
 
 def keep(error: Exception, grid: Grid, *values: Callable[[], Nodes]) -> None:
     """Attach to an exception the first of several node values that can still be read after a failure."""
+    failed: Any = error
     for value in values:
         # a donated buffer, or one that depends on the failed program, raises when it is read
         with contextlib.suppress(Exception):
-            error.kept = np.asarray(value()), grid  # type: ignore[attr-defined]
+            failed.kept = np.asarray(value()), grid
             return
 
 
@@ -263,7 +264,7 @@ def with_solution(clock: Clock, needed: int, partial: Callable[[Kept | None], So
         where = f"It stopped during {clock.phase}; the value so far is .solution of this exception."
         if starved:
             raise _memory_error(error, needed, where, solution) from error
-        error.solution = solution  # type: ignore[attr-defined]
+        attach_solution(error, solution)
         error.add_note(where)
         raise
 
@@ -277,7 +278,7 @@ def _memory_error(error: Exception, needed: int, where: str, solution: Solution 
         f"memory ran out: {said}\nThe run was estimated at {needed / 1e9:.3g} GB{left}. Use fewer nodes or "
         f"dtype='float32'; {memory.NO_GRID}.\n{where}"
     )
-    report.solution = solution  # type: ignore[attr-defined]
+    attach_solution(report, solution)
     return report
 
 

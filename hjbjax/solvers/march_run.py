@@ -15,7 +15,7 @@ from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.checkpoints import check_alike
 from hjbjax.solution.clock import CUT, Clock
-from hjbjax.solution.solution import Solution, question
+from hjbjax.solution.solution import Solution, attach_solution, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import WideJit
@@ -311,7 +311,7 @@ class MarchRun:
             # without a feedback, whose program would call the failed function again
             self.store(feedback=False)
         solution = assemble(self.task, self.task.grid, self.slices, self.gathered(), Status.INTERRUPTED)
-        error.solution = solution  # type: ignore[attr-defined]
+        attach_solution(error, solution)
 
 
 def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status) -> Solution:

@@ -10,6 +10,7 @@ H = βψ − ψ_t − ν l_t has at most two roots ν, because H is a minimum of
 concave in ν. The first positive root gives the costate of a path that arrives from outside.
 """
 
+import dataclasses
 import warnings
 from typing import Protocol
 
@@ -64,6 +65,18 @@ def _rest_loop(bvp: BoundaryValueProblem, x: State) -> jax.Array:
     return bvp.flow(0.0, jnp.concatenate([x, p, jnp.zeros(1, x.dtype)]), bvp.arcs[0])[: bvp.n]
 
 
+@dataclasses.dataclass(frozen=True)
+class _Leaving:
+    """The event at which a path reaches the distance ``far`` from the origin, where SciPy ends the integration."""
+
+    far: np.floating
+    terminal: bool = True
+
+    def __call__(self, t: float, x: np.ndarray) -> np.floating:
+        """Negative inside the ball."""
+        return np.linalg.norm(x) - self.far
+
+
 def into_rest(bvp: BoundaryValueProblem, start: State, duration: float, clock: Clock) -> tuple[np.ndarray, np.ndarray]:
     """Times and columns (x, p, w) under the Riccati costate, or of a line to the rest point if this loop diverges."""
     from scipy.integrate import solve_ivp
@@ -72,16 +85,12 @@ def into_rest(bvp: BoundaryValueProblem, start: State, duration: float, clock: C
     assert rest is not None
     times, far = np.linspace(0, duration, COLUMNS), FAR * (1 + np.linalg.norm(start))
 
-    def away(t: float, x: np.ndarray) -> np.floating:
-        return np.linalg.norm(x) - far
-
     def flow(t: float, x: np.ndarray) -> np.ndarray:
         clock.look()
         return np.asarray(_rest_loop(arrays, x))
 
-    away.terminal = True  # type: ignore[attr-defined]
     with np.errstate(all="ignore"):
-        path = solve_ivp(flow, (0, duration), start, t_eval=times, events=away, rtol=1e-5)
+        path = solve_ivp(flow, (0, duration), start, t_eval=times, events=_Leaving(far), rtol=1e-5)
     states = path.y  # (n, COLUMNS), or fewer columns if the loop diverged
     if states.shape[1] < len(times) or not np.all(np.isfinite(states)):
         decay = np.exp(-5 * times / duration)  # e⁻⁵ at the end, 0.7 % of the distance

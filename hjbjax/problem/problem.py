@@ -247,9 +247,9 @@ def _payoff(costs: dict[str, Any], rewards: dict[str, Any]) -> str:
     )
 
 
-def _payment(paid: object, name: str) -> Any:
+def _payment(paid: Any, name: str) -> Any:
     """A running payment as a function, any other payment as a function or a number."""
-    return as_partial(paid, name) if name in ("Problem.cost", "Problem.reward") else _function_or_number(paid, name)  # type: ignore[arg-type]
+    return as_partial(paid, name) if name in ("Problem.cost", "Problem.reward") else _function_or_number(paid, name)
 
 
 def _is_nonzero(discount: Callable | Number) -> bool:

@@ -6,6 +6,7 @@ rewards by costs, minus the rewards, before anything else, and gives its results
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -51,22 +52,22 @@ def _negative_function(function: Callable) -> Callable:
     It is a closure, not an object, so that the numbers that the function reads from outside are found.
     """
 
-    def paid(*arguments: Any, **options: Any) -> Any:
+    # ``__wrapped__`` is the signature that messages show; an object without a name is called reward
+    @functools.wraps(function, assigned=("__name__",), updated=())
+    def reward(*arguments: Any, **options: Any) -> Any:
         return _negative_number(function(*arguments, **options))
 
-    paid.__wrapped__ = function  # type: ignore[attr-defined]  # the signature that messages show
-    paid.__name__ = getattr(function, "__name__", "reward")
-    return paid
+    return reward
 
 
 def _negative_number(number: Any) -> Any:
     """Minus real numbers; anything else is returned unchanged, to be refused by the checks in the user's words."""
-    if isinstance(number, (bool, str)) or not isinstance(number, (int, float, np.ndarray, np.generic, jax.Array)):
+    if isinstance(number, (bool, str)) or not isinstance(number, (int, float, np.ndarray, np.number, jax.Array)):
         return number
     kind = jnp.result_type(number)
     if jnp.issubdtype(kind, jnp.unsignedinteger) or not jnp.issubdtype(kind, jnp.number):
         return number
-    return 0 - number  # type: ignore[operator]  # not −number: minus zero is zero
+    return 0 - number  # not −number: minus zero is zero
 
 
 def negative_ends(grid: Grid) -> Grid:

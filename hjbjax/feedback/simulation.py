@@ -323,7 +323,7 @@ def _promised(problem: Problem, feedback: Feedback, start: np.ndarray) -> float 
 
 def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:
     """True for a feedback that is stored at several times."""
-    return getattr(feedback, "times", None) is not None
+    return is_grid_feedback(feedback) and feedback.times is not None
 
 
 def _due(feedback: Feedback, duration: float) -> str:

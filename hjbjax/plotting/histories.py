@@ -10,9 +10,8 @@ import numpy as np
 
 from hjbjax.plotting.scales import set_ticks
 from hjbjax.plotting.shading import is_level, limits_around
-from hjbjax.plotting.slices import span_of
+from hjbjax.plotting.slices import described, span_of
 from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend
-from hjbjax.problem.labels import Labels
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -95,7 +94,7 @@ def controls(
     """
     times, inputs = np.asarray(path.times), np.asarray(path.controls)
     count = inputs.shape[1]
-    words = getattr(solution, "labels", Labels())
+    words = described(solution).labels
     names = tuple(names or (words.control(i, count) for i in range(count)))
     ax = axes_of(ax, wide=True)
     # a step continues through the last interval; a line stops before it, because the control at the end is unknown

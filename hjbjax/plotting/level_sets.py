@@ -22,6 +22,7 @@ from hjbjax.plotting.slices import (
     closed_axis,
     closed_field,
     cut_field,
+    described,
     region_of,
     section_of,
     sets_of,
@@ -29,7 +30,7 @@ from hjbjax.plotting.slices import (
 from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, legend, solid_axes
 from hjbjax.plotting.surfaces import level_surface, lit, thinned
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.labels import SIDES, Labels
+from hjbjax.problem.labels import SIDES
 from hjbjax.problem.pytree import keywords, refuse_misspelt
 from hjbjax.solution.files import Path, write_whole
 
@@ -204,7 +205,7 @@ class Scene:
 def _field(solution: Solution, inside: str | None, time: float | None) -> Field:
     """The value at one time, with its sign flipped if the set is {V ≥ 0}."""
     if inside is None:
-        inside = getattr(solution, "labels", Labels()).inside
+        inside = described(solution).labels.inside
     if inside not in SIDES:
         raise ValueError(f"zero_level_set: got inside = {inside!r}, wanted 'below' (V ≤ 0) or 'above' (V ≥ 0)")
     values, caption = at_time(solution, solution.value, time)
@@ -325,7 +326,7 @@ def animation(
     """
     from matplotlib.animation import FuncAnimation
 
-    if getattr(solution, "times", None) is None:
+    if described(solution).times is None:
         raise ValueError("animation: the solution is stationary; use march(..., times=np.linspace(0, horizon, 41))")
     if not callable(draw):
         raise TypeError(f"animation: got draw = {draw!r}, wanted a function such as hjb.plotting.value")

@@ -17,6 +17,7 @@ from hjbjax.plotting.slices import (
     Section,
     at_states,
     at_time,
+    described,
     feedback,
     line_in_box,
     region_of,
@@ -28,7 +29,6 @@ from hjbjax.plotting.slices import (
 )
 from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend, new_figure, styled
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.labels import Labels
 from hjbjax.problem.types import Number, State
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def value(
     section = section_of("value", field, solution.grid, fixed, caption)
     ax = axes_of(ax)
     # .data has the masked numbers: infinity means unreachable, NaN must not be labelled so
-    name = getattr(solution, "labels", Labels()).of_value
+    name = described(solution).labels.of_value
     lost = section.values.data[section.values.mask]
     hidden = "V = ∞" if np.all(np.isposinf(lost)) else "V = −∞" if np.all(np.isneginf(lost)) else "V not finite"
     section, regions = _without(section, target_of(solution, time) if target is None else target)
@@ -131,7 +131,7 @@ def policy(
     section, label = feedback(solution, input, fixed, time)
     ax = axes_of(ax)
     section, regions = _without(section, target_of(solution, time))
-    cells = getattr(solution, "discrete", False) or jumps(section.values.compressed())
+    cells = described(solution).discrete or jumps(section.values.compressed())
     span = span_of(solution, input)
     inner = (slice(1, -1),) if len(section.axes) == 1 else ()
     # skip the two ends of a line, where the run ends, because hatches half a cell wide show nothing

@@ -8,7 +8,7 @@ import difflib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
@@ -53,6 +53,21 @@ class Section(NamedTuple):
         )
 
 
+class Described(NamedTuple):
+    """Members of a Solution that reachability solutions and a user's stand-ins may leave out; see ``described``."""
+
+    labels: Labels = Labels()
+    times: Array | None = None
+    problem: Any = None  # a Problem, or a stand-in of the user
+    discrete: bool = False  # the mean of two enumerated controls may not be admissible
+
+
+def described(solution: "Solution | None") -> Described:
+    """The optional members of a solution, with their defaults where it has none."""
+    given = {name: getattr(solution, name) for name in Described._fields if hasattr(solution, name)}
+    return Described(**given)
+
+
 class Region(NamedTuple):
     """A set in the plane of a section: its name, a fine raster with its function, ≤ 0 inside, and the nodes inside."""
 
@@ -81,8 +96,7 @@ def region_of(function: Callable[[State], Number], section: Section, label: str)
 
 def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.ndarray, str]:
     """The field at the stored time closest to ``time``, and a caption with this time."""
-    # reachability solutions and stand-ins defined by a user may not have times
-    field, times = np.asarray(field), getattr(solution, "times", None)
+    field, times = np.asarray(field), described(solution).times
     if times is None:
         if time is not None:
             raise ValueError(f"time: got {time!r}, but the solution is stationary; leave time out")
@@ -94,7 +108,7 @@ def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.
 
 def target_of(solution: "Solution", time: float | None = None) -> Callable[[State], Number] | None:
     """The target of the solution's problem at the time of the plot; ``None`` if unknown."""
-    problem = getattr(solution, "problem", None)
+    problem = described(solution).problem
     if problem is None or problem.target is None:
         return None
     if not problem.time_dependent:
@@ -105,7 +119,7 @@ def target_of(solution: "Solution", time: float | None = None) -> Callable[[Stat
 
 def sets_of(solution: "Solution", time: float | None = None) -> dict[str, Callable[[State], Number]]:
     """The sets whose signed distances define a reachability problem, by name, as functions ≤ 0 inside."""
-    problem = getattr(solution, "problem", None)
+    problem = described(solution).problem
     if problem is None or problem.target is not None or problem.cost is not None:
         return {}
     moment = _moment(solution, time) if problem.time_dependent else 0.0
@@ -129,7 +143,8 @@ def _moment(solution: "Solution", time: float | None) -> float:
 
 def span_of(solution: "Solution", input: int) -> float:
     """The length of the range of one control; 0 if unknown."""
-    controls = getattr(getattr(solution, "problem", None), "controls", None)
+    problem = described(solution).problem
+    controls = None if problem is None else problem.controls
     if isinstance(controls, Box):
         return float(controls.hi[input] - controls.lo[input])
     return 2 * float(controls.radius) if isinstance(controls, Ball) else 0.0
@@ -156,9 +171,9 @@ def feedback(solution: "Solution", input: int, fixed: Cuts | None, time: float |
     # where V is infinite all controls are equally bad, so the greedy control is meaningless
     known = np.isfinite(at_time(solution, solution.value, time)[0])
     field = np.where(known, inputs[..., input], np.nan)
-    nearest = getattr(solution, "discrete", False)  # the mean of two enumerated controls may not be admissible
-    label = getattr(solution, "labels", Labels()).control(input, count)
-    return section_of("policy", field, solution.grid, fixed, caption, nearest), label
+    extra = described(solution)
+    label = extra.labels.control(input, count)
+    return section_of("policy", field, solution.grid, fixed, caption, extra.discrete), label
 
 
 def section_of(

@@ -651,10 +651,13 @@ def test_output_that_cannot_be_written(words):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a disk that is full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize(("words", "code"), [(["list"], 5), (["lst"], 2)])
-def test_nobody_hears_the_refusal(words, code):
+def test_nobody_hears_the_refusal(words, code, unbuffered):
+    command = [sys.executable, "-m", "hjbjax", *words]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with open("/dev/full", "w") as full:
-        result = subprocess.run([sys.executable, "-m", "hjbjax", *words], stdout=full, stderr=full, timeout=120)
+        result = subprocess.run(command, stdout=full, stderr=full, env=environment, timeout=120)
     assert result.returncode == code
 
 

@@ -56,7 +56,7 @@ def refused(words, part, code=2):
 @pytest.fixture
 def _no_child(monkeypatch):
     """A test in which no process may be started."""
-    monkeypatch.setattr(children, "run", lambda *_, **__: pytest.fail("a process was started"))
+    monkeypatch.setattr(children, "run_children", lambda *_, **__: pytest.fail("a process was started"))
 
 
 @pytest.mark.usefixtures("_no_child")
@@ -107,7 +107,7 @@ def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):
     (tmp_path / "pendulum").mkdir()
     (tmp_path / "pendulum" / "value.png").touch()
     (tmp_path / "run.npz").touch()
-    monkeypatch.setattr(children, "run", lambda *_, **__: ChildEnds((End(0, 0), End(1, 0))))
+    monkeypatch.setattr(children, "run_children", lambda *_, **__: ChildEnds((End(0, 0), End(1, 0))))
     for more in (("--force", "--checkpoint", "run", "--resume"), ("--dry-run",)):
         assert CliRunner().invoke(main, ["launch", "--", "solve", "pendulum", *more]).exit_code == 0
 

@@ -655,9 +655,9 @@ def test_output_that_cannot_be_written(words):
 @pytest.mark.parametrize(("words", "code"), [(["list"], 5), (["lst"], 2)])
 def test_nobody_hears_the_refusal(words, code, unbuffered):
     command = [sys.executable, "-m", "hjbjax", *words]
-    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    variables = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with open("/dev/full", "w") as full:
-        result = subprocess.run(command, stdout=full, stderr=full, env=environment, timeout=120)
+        result = subprocess.run(command, stdout=full, stderr=full, env=variables, timeout=120)
     assert result.returncode == code
 
 

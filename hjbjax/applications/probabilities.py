@@ -348,7 +348,8 @@ def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     # the values of traced functions are unknown; see the module docstring
     if is_traced(question, grid):
         return 0
-    method = options.get("method") or ValueIteration()  # takes the least memory; solve checks its own method again
+    # without a method, the one that takes the least memory; ``solve`` checks the memory of the method that it uses
+    method = options.get("method") or ValueIteration()
     with own_settings(x64=kind == np.float64):
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)

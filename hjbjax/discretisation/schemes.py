@@ -57,16 +57,16 @@ solve requires a monotone scheme, and does not check values.
 
 For a scheme that follows paths over many cells instead of using slopes, see ``hjbjax.semi_lagrangian``.
 
-All schemes treat walls in the same way. A wall is on a node, whose cell is half a cell. With noise a, outward drift n
-(f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
+All schemes treat walls in the same way. A wall passes through a node, so the cell of that node is half as wide. With
+noise a, outward drift n (f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
 
     (h/2)(βV − L) = −(a/2h − n/2)(V_N − V_{N−1}),      so the chain moves inwards at the rate (a − h n)/h²:
 
-the mirrored neighbour V_{N+1} = V_{N−1} gives a/h² (V_{N−1} − V_N), and the drift acts on the inner difference. For V
-the drift at the wall matters little: an error O(h) at one node is O(h²). For the law of the chain, outward drift must
-hold noise back as inward drift helps it: then p_N/p_{N−1} = (a + h n)/(a − h n), as between two interior nodes. A chain
-uses (e(n⁺) − h n)/h², with e for the outward part of the drift. This is never negative, and without noise it is |n|/h
-for n < 0 and zero for n > 0, where the drift is cut off.
+the mirrored neighbour V_{N+1} = V_{N−1} gives a/h² (V_{N−1} − V_N), and the drift acts on the inner difference. The
+drift at the wall hardly affects V: an error O(h) at this one node changes V by O(h²). It does affect the law of the
+chain: outward drift must reduce the rate by as much as inward drift raises it. Then p_N/p_{N−1} = (a + h n)/(a − h n),
+as between two interior nodes. A chain uses (e(n⁺) − h n)/h², with e for the outward part of the drift. This rate is
+never negative. Without noise it is |n|/h for n < 0 and zero for n > 0, where the drift is cut off.
 """
 
 import functools

@@ -103,10 +103,10 @@ def stationary_density(
     """The stationary density of the chain under a policy: 𝓛*p = 0, with integral one.
 
     It is the stationary probability of each node divided by the volume of its cell, and scaled so that
-    ``np.sum(density * grid.volumes())`` is one. The cell is half a cell at a wall on which noise reflects. It is a
-    whole cell at an end of an axis without noise, where drift enters and leaves at the rate |f|/h, as inside the box.
-    The density is second order, also at walls, where central differences are monotone, and first order elsewhere. It is
-    computed by a sparse LU factorisation, see ``stationary_law``. Arguments as for ``generator``.
+    ``np.sum(density * grid.volumes())`` is one. The cell of a node on a wall that reflects noise is half
+    as wide. At an end of an axis without noise it is a whole cell, where drift enters and leaves at the rate |f|/h, as
+    inside the box. The density is second order, also at walls, where central differences are monotone, and first order
+    elsewhere. It is computed by a sparse LU factorisation, see ``stationary_law``. Arguments as for ``generator``.
 
     Returns:
       The density at the nodes, shape (*grid), in 1/(units of the states); zero at transient nodes.

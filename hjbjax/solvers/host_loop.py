@@ -101,7 +101,7 @@ class Run(Part, Protocol):
         """The options of its progress bar."""
 
     def compile(self) -> None:
-        """Call the jitted passes without one."""
+        """Compile the jitted passes by a call that makes no pass."""
 
     def first_chunk(self, clock: Clock) -> int:
         """The number of passes of the first chunk, before any is timed."""

@@ -356,7 +356,7 @@ def _finite_part(task: Task, reached: Mask) -> Task:
 
 
 def is_carried_past(reach: Reach) -> bool:
-    """True if from some nodes the chain reaches the target with some probability, but under no policy surely."""
+    """True if some nodes reach the target with positive probability, but not with probability one under any policy."""
     return bool(np.any(reach.maybe & ~reach.surely))
 
 

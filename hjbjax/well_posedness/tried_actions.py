@@ -62,7 +62,7 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
 def beside_samples(on: Discretisation, player: Player) -> list[list]:
     """The actions to try once, in addition to all samples; each input (*grid).
 
-    A single input is set to where a component of the drift vanishes; for a ball see ``_of_a_ball``.
+    A single input takes the values at which a component of the drift vanishes; for a ball see ``_of_a_ball``.
     """
     if not _knows_kinks(on, player):
         return []

@@ -101,7 +101,7 @@ def reach_probability(
     problem, inside, hit = _system(problem, target, obstacle, feedback, horizon, name)
     if _has_no_chance(problem, options):
         decides = least and (problem.is_game or problem.controls is not None)
-        # avoiding the target with an obstacle is not a tube
+        # avoiding the target is not a tube if there is an obstacle
         if not (decides and hit is not None):
             with _no_fallback_warning(feedback):
                 return _yes_or_no(problem, grid, (inside, hit), horizon, options, least=decides)
@@ -214,7 +214,7 @@ def expected_exit_time(
         if horizon is None:
             # the user's options take precedence; march has no tolerance
             options = {"tol": TOL} | options
-            # an infinite least time is found; the greatest time would grow without end
+            # an infinite least time is found; the greatest time would grow indefinitely
             if greatest:
                 _refuse_staying(question, grid, options)
             elif _has_no_chance(problem, options) and not problem.is_game:

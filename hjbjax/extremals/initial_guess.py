@@ -31,7 +31,7 @@ COLUMNS = 101  # of a guess; the solver adds nodes where necessary
 SAMPLES = 400  # number of intervals in which a simulated guess keeps its control constant, because a feedback may jump
 FAR = 1e3  # times 1 + |x₀|: a simulation that gets there has diverged
 NEWTON = 50  # steps to the boundary of a target; a distance takes one, a squared distance about ten
-POWERS = np.arange(-80.0, 81.0)  # exponents of two for ν, which has the units of cost over those of l
+POWERS = np.arange(-80.0, 81.0)  # exponents of two for ν, whose units are the units of cost divided by the units of l
 FINER = np.linspace(0.0, 1.0, 65)  # between two powers, for two digits
 BUDGET = 16  # number of constant controls to try
 

@@ -102,7 +102,7 @@ class Extremal:
 
 
 def with_payoff(extremal: Extremal, payoff: str) -> Extremal:
-    """The extremal with costates, values and H of costs or of rewards; the solver's are those of costs."""
+    """A solver's extremal, which is about costs, with the costates, values and H of ``payoff``: costs or rewards."""
     if extremal.payoff == payoff:
         return extremal
     check = extremal.optimality_check

@@ -56,9 +56,9 @@ class Evaluation(abc.ABC):
 
     @property
     def rough(self) -> bool:
-        """True if it only relaxes: steps are cheap, and the loop switches to a linear solve if it stalls.
+        """True if the evaluation only relaxes. Steps are cheap, and the loop switches to a linear solve if it stalls.
 
-        For other evaluations the residual is checked. If they fail, for example for a policy without a value, the
+        The residual of other evaluations is checked. If one fails, for example because the policy has no value, the
         equation is relaxed instead.
         """
         return False

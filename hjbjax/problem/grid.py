@@ -223,8 +223,8 @@ class Grid:
         total = np.ones(())
         for axis, count in enumerate(self.shape):
             gaps = np.diff(np.append(np.asarray(self.axis(axis)), self.hi[axis] if self.periodic[axis] else []))
-            # Each gap gives half to the node on either side. A periodic axis has one gap per node, so the two slices
-            # are the same, which is right because it is uniform.
+            # Each gap gives half to the node on either side. A periodic axis has one gap per node, and both slices are
+            # the whole axis. This is correct because its gaps are equal.
             share = np.zeros(count)
             share[: len(gaps)] += gaps / 2
             share[-len(gaps) :] += gaps / 2

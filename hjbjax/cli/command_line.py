@@ -79,7 +79,7 @@ class OneLineGroup(click.Group):
 
 
 def _is_joined() -> bool:
-    """True in a process of a launch that has failed before it parted from the others; they would hold up its end."""
+    """True in a process of a launch that failed before it left the launch; a normal exit would wait for the others."""
     if "jax" not in sys.modules:
         return False
     try:
@@ -105,7 +105,7 @@ def _own_endings() -> Iterator[None]:
 
 
 def _for_a_parameter(error: click.ClickException) -> str | None:
-    """The message if a parameter of a problem was given as an option of the command; None for other errors."""
+    """The message if a parameter of a problem was passed as an option of the command; None for other errors."""
     if not isinstance(error, click.NoSuchOption):
         return None
     name = error.option_name.lstrip("-").replace("-", "_")

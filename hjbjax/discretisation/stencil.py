@@ -1,7 +1,7 @@
 """Neighbours and one-sided differences on a grid, with ghost cells.
 
-An edge that is neither periodic nor open is a wall on its node. For drift, the value beyond is a copy of the node, so
-the one-sided difference is zero and outward drift is projected onto the box. For noise it is the mirror image,
+An end that is neither periodic nor open is a wall through its last node. For drift, the value beyond is a copy of the
+node, so the one-sided difference is zero and outward drift is projected onto the box. For noise it is the mirror image,
 V_{N+1} = V_{N−1}: a reflected path has ∂V/∂n = 0 there, which an even extension satisfies to second order, while the
 copy would move the wall outwards by half a spacing. Beyond an open end the value is extrapolated by the parabola
 through the last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} for equal spacings.

@@ -4,10 +4,10 @@ The guess from a solution on a grid is its closed loop, with the interpolated DV
 point is the closed loop under the Riccati costate, whose control is clipped to the admissible set. Otherwise the guess
 is a line between the ends, a line to the boundary of the target, or a path under the best constant control.
 
-A zero costate is a bad guess. If effort has a cost, u is zero under it and nothing moves. The equations then do not
-depend on the final time, so their Jacobian is singular. On the boundary of a target p = ψ_x + ν l_x, and the condition
-H = βψ − ψ_t − ν l_t has at most two roots ν, because H is a minimum of functions that are affine in p and therefore
-concave in ν. The first positive root gives the costate of a path that arrives from outside.
+A zero costate is a bad guess. If effort has a cost, a zero costate gives u = 0 and nothing moves. The equations then do
+not depend on the final time, so their Jacobian is singular. On the boundary of a target p = ψ_x + ν l_x, and the
+condition H = βψ − ψ_t − ν l_t has at most two roots ν, because H is a minimum of functions that are affine in p and
+therefore concave in ν. The first positive root gives the costate of a path that arrives from outside.
 """
 
 import dataclasses

@@ -128,7 +128,8 @@ def dissipation(
       The energies of k (1 + random + given) paths and their margins; ``print`` shows the tightest margin of each kind.
 
     Raises:
-      ValueError: no disturbances, random ones of a finite set, noise, a marched solution, or starts outside the grid.
+      ValueError: the problem has no disturbances, or has noise; random disturbances are requested from a finite set;
+        the solution was marched; or a start is outside the grid.
       TypeError: a signal that cannot be called.
 
     Example:

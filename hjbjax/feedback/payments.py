@@ -141,8 +141,8 @@ def promise(feedback: object, start: Array, t: float = 0.0) -> float | None:
 def still_ahead(problem: Problem, feedback: object, path: Path, weight: float, *, to_horizon: bool) -> float | None:
     """The cost that V predicts after the end of a short path, discounted to the start of the path.
 
-    An undiscounted path that rests or circles outside the target never gets what V promised, so nothing is added. None
-    if V does not predict the cost that follows.
+    An undiscounted path that rests or circles outside the target never achieves the V that was promised, so nothing is
+    added. None if V does not predict the cost that follows.
 
     Args:
       problem: the simulated problem.

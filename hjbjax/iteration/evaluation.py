@@ -95,8 +95,8 @@ class Evaluation(abc.ABC):
 class Sweeps(Evaluation):
     """Approximate evaluation by Gauss–Seidel: ``count`` forward and backward sweeps in every order of the axes.
 
-    The work is about equal to ``count`` 2^n relaxations of every node. Runs in float32 on the correction. If the grid
-    exceeds the cache of a CPU, each slab of it is swept 2 ``count`` - 1 times (at least three) in each of two
+    The work is about equal to ``count`` 2^n relaxations of every node. The correction is computed in float32. If the
+    grid exceeds the cache of a CPU, each slab of it is swept 2 ``count`` - 1 times (at least three) in each of two
     directions.
     """
 

@@ -43,7 +43,7 @@ class GridTask:
 
     @property
     def division(self) -> Layout:
-        """The layout of the iteration: parts over the mesh, or one device if there is no mesh or the grid is too small."""
+        """The layout of the iteration: parts over the mesh; one device without a mesh, or if the grid is too small."""
         parts = None if self.mesh is None else Parts(self.grid.shape, self.mesh)
         return parts if parts is not None and parts.fits else self.layout
 
@@ -52,7 +52,7 @@ class GridTask:
         return altered(self, on=altered(self.on, grid=placed(self.grid, layout)))
 
     def over_nodes(self: T, shape: tuple[int, ...]) -> T:
-        """A tree of bools, True for the leaves that have a value at every node, which are those of this ``shape``."""
+        """A tree of bools, True for leaves with a value at every node, that is, leaves of this ``shape``."""
 
         def mark(leaf: Any) -> bool:
             return np.shape(leaf) == shape

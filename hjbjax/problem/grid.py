@@ -2,8 +2,8 @@
 
 Node-centred: both ends of an ordinary axis are nodes; a periodic axis omits its upper end. Coordinates are
 x_i = (lo·(M − i) + hi·i)/M with M = N − 1 (M = N on a periodic axis), so that a node at zero is exactly zero. NumPy
-computes them once, as one table per axis that is stored with the grid. A compiled division rounds differently, and a
-node on the boundary of a target must be inside or outside it in all programs alike.
+computes them once, as one table per axis that is stored with the grid. A compiled division rounds differently, but all
+programs must agree whether a node on the boundary of a target is inside.
 """
 
 import dataclasses

@@ -125,7 +125,7 @@ def front_door(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function: sets the package's JAX options and adds ``with_suggestions``.
 
     If ``solve`` or ``march`` raises inside the function, the message begins with the name of the outer function. Ctrl-C
-    is a ``KeyboardInterrupt`` also if it fell into a call of the host from a compiled program, as under ``grad``.
+    is a ``KeyboardInterrupt`` even if it came while a compiled program called the host, as under ``grad``.
     """
 
     @functools.wraps(function)

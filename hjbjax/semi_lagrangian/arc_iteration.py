@@ -79,7 +79,7 @@ class ArcState:
 
 
 class _Look(NamedTuple):
-    """An evaluation of all arcs: the least Q, the number of its arc, and the largest (V − Q)⁺/``_unit`` over the arcs."""
+    """An evaluation of all arcs: the least Q, the number of its arc, and the largest (V − Q)⁺/``_unit`` of an arc."""
 
     worth: Field
     number: AtNodes

@@ -50,10 +50,10 @@ class SemiLagrangian(Scheme, Paths):
     Otherwise they are about ``actions`` samples, and the distance between samples limits the accuracy of the control.
     The policy is the action of the best arc.
 
-    Works with ``solve`` outside JAX transformations, by ``ValueIteration()`` or ``PolicyIteration(Sweeps(...))``, without
-    noise, disturbances or a ``running_max``, with projected or periodic ends. Without a discount it requires a target or a
-    ``stopping_cost``, and a positive running cost. The grid error is not estimated. Memory: in 2-D, 36 bytes per node
-    and arc, with three arcs per action.
+    Works with ``solve`` outside JAX transformations, by ``ValueIteration()`` or ``PolicyIteration(Sweeps(...))``,
+    without noise, disturbances or a ``running_max``, with projected or periodic ends. Without a discount it requires a
+    target or a ``stopping_cost``, and a positive running cost. The grid error is not estimated. It stores 36 bytes per
+    node and arc in 2-D, with three arcs per action.
 
     Args:
       cells: the number of cells that the longest arc crosses. More cells mean less interpolation and a coarser control.

@@ -358,8 +358,7 @@ def _prepare(
         time_probes.warn_of_fast_changes(found, horizon, step)
         longest, left = (found.lengths[:, None], found.left) if step is None else (step, 0.0)
     elif step is None and (looks[0] or not method.limited or problem.killing is not None):
-        # rates found during the march do not limit its first steps, and only a discount that is a number is integrated
-        # exactly
+        # rates found during the march do not limit its first steps, and only a constant discount is integrated exactly
         longest = horizon / FEWEST
     obstacles = None if moving or not policy else _obstacles(on)
     return March(

@@ -57,8 +57,8 @@ def choose(
 
     ``divided``: the nodes are divided among several devices, so no host has all of them.
 
-    Large grids are nested. For tubes without discount, whose policies have no value of their own, only value iteration
-    converges to the extreme one of many fixed points.
+    Large grids are nested. For tubes without discount, whose policies have no unique value, only value iteration
+    converges to the right one of many fixed points.
     """
     if method is not None:
         return method.filled(choose_evaluation(problem, grid, traced=traced, divided=divided))

@@ -85,7 +85,7 @@ class Study:
 
     @property
     def fitted(self) -> np.ndarray:
-        """A mask of the grids that count for the orders: those that converged with an error above the tolerance."""
+        """A mask of the grids that count for the orders: grids that converged with an error above the tolerance."""
         converged = np.array([status is Status.CONVERGED for status in self.statuses])
         # a smaller error may come from the iteration instead of the grid
         return converged & np.isfinite(self.errors) & (self.errors > self.tol)
@@ -208,7 +208,7 @@ def convergence_study(
     if is_traced(problem, grids, reference):  # seconds, statuses and masks must be concrete
         raise ValueError("convergence_study: it runs at host level only, outside of jit, vmap and grad")
     ordered = _sort(grids)
-    check_reference(reference, ordered)  # before any solve, whose time an error would waste
+    check_reference(reference, ordered)  # before any solve, because a late error would waste the time of the solves
     compared = ordered if reference is not None else ordered[:1] * len(ordered)  # the estimate is on the coarsest grid
     masks = [mask_of(region, grid) for grid in compared]
     # evaluate the reference before the first solve, so that a bad reference is refused at once

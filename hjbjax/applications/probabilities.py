@@ -302,7 +302,7 @@ def _yes_or_no(
         question, is_one = exit_problems.arrival(problem, *sets), _is_finite
     else:
         question, is_one = exit_problems.tube(problem, *sets, least=least), _above if least else _below
-    # warnings about that question, such as infinite times, do not apply to the probability
+    # warnings about the auxiliary problem, such as infinite times, do not apply to the probability
     with keeping_warnings(), _map_partial(lambda partial: _decided(partial, is_one)):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
     return _decided(found, is_one)

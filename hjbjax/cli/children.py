@@ -15,8 +15,8 @@ interrupt the launcher between starting a child and recording it:
 A request to end is SIGTERM, and also SIGCONT for a stopped child. A launcher that is killed cannot send it, but
 children started by ``followed`` notice this: their standard input is a pipe that closes with the launcher.
 
-This file imports only the standard library and also runs as the script of a child. A child therefore follows its
-launcher within milliseconds, although importing JAX takes seconds.
+This file imports only the standard library and also runs as the script of a child. A child therefore reacts to the end
+of its launcher after milliseconds, although importing JAX takes seconds.
 """
 
 import collections
@@ -178,7 +178,7 @@ class _Launcher:
         self.stopped: tuple[int, ...] = ()
         self.late: tuple[int, ...] = ()
         self.killed: tuple[int, ...] = ()
-        self.quiet = threading.Event()  # if set, the first child's output only concerns the missing others
+        self.quiet = threading.Event()  # if set, output of the first child is only about missing children
         self.unwritten: list[OSError] = []
 
     def start(self, command: Command) -> None:

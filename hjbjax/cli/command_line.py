@@ -217,7 +217,7 @@ def finite(text: str, kind: type[N]) -> N | None:
 def unknown(what: str, got: str, allowed: Iterable[str]) -> str:
     """The message for an unknown name, with the allowed names and the closest one."""
     names = list(allowed)
-    # with hyphens first, for problem names in Python spelling, then as given, for parameters, which have underscores
+    # first with hyphens, for names of problems in Python spelling; then unchanged, because parameters have underscores
     near = difflib.get_close_matches(got.lower().replace("_", "-"), names, 1) or difflib.get_close_matches(
         got, names, 1
     )

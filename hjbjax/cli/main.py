@@ -261,7 +261,7 @@ def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | 
 def _one_line_warnings() -> Iterator[None]:
     """Show warnings as one line each, without the source line that Python adds.
 
-    JAX repeats a fault of its cache for every program. Only the first of them is shown.
+    JAX repeats a warning about its cache for every program. Only the first one is shown.
     """
     from hjbjax.solvers import compile_cache
 

@@ -165,7 +165,7 @@ def _reflecting(grid: Grid, axis: int, step: int) -> Array:
 
 
 def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
-    """Add the diagonal jumps of a pair of axes; those that leave the box go to the mirror image (noise reflects)."""
+    """Add the diagonal jumps of a pair of axes; a jump out of the box goes to the mirror image (noise reflects)."""
     scale = 2 * grid.spacing(i) * grid.spacing(j)
     pairs = list(itertools.product((1, -1), repeat=2))
     # a_ij⁺ along the diagonal, a_ij⁻ across it

@@ -50,10 +50,10 @@ and the kinks of the gain of a drift component; its solutions are certified. The
     ('CONVERGED', 0.17)
 
 The exact value is (√5 − 1)/8 = 0.155; the difference is due to the large diffusion. The diffusion must satisfy
-e ≥ max(a, h⁺f, −h⁻f), here a ``speed`` of at least |f|, because probabilities cannot be negative. With less, the chain
-would represent only part of the drift, and the solve is refused. The class must be hashable, since compiled programs
-are cached by it. Its methods are traced, so they must not branch on numbers. Under ``jit``, ``vmap`` and ``grad`` a
-solve requires a monotone scheme, and does not check values.
+e ≥ max(a, h⁺f, −h⁻f), here a ``speed`` of at least |f|, because probabilities cannot be negative. With a smaller e the
+chain would represent only part of the drift, and the solve is refused. The class must be hashable, since compiled
+programs are cached by it. Its methods are traced, so they must not branch on numbers. Under ``jit``, ``vmap`` and
+``grad`` a solve requires a monotone scheme, and does not check values.
 
 For a scheme that follows paths over many cells instead of using slopes, see ``hjbjax.semi_lagrangian``.
 
@@ -116,7 +116,7 @@ def falls_short(scheme: Chain, f: Any, a: Any, link: Links) -> Any:
 def kinks(
     scheme: Chain, a: Any, slopes: tuple[Any, Any], link: Links, grid: Grid, axis: int
 ) -> tuple[Sequence[Any], Sequence[Any]]:
-    """The drifts at which the derivative of the gain of ``weights`` jumps, and its derivatives, one more."""
+    """The drifts at which the derivative of the gain of ``weights`` jumps, and its derivatives between them."""
     found, derivatives = scheme.kinks(a, slopes, link)
     if not stencil.has_walls(grid, axis):
         return found, derivatives

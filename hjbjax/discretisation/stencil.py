@@ -184,7 +184,7 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
     cyclic, layout = bool(grid.periodic[axis]), grid.layout
     if not (cyclic or layout.is_divided(axis)):
         return ended
-    # the slices of the other side at the end that faces this one
+    # the slices at the opposite end of the adjacent part
     given = slices(values, grid, axis, -step, count=ended.shape[axis])
     found = layout.fetched(given, axis, step, cyclic=cyclic)
     return found if cyclic else jnp.where(layout.at_end(axis, step), ended, found)

@@ -189,7 +189,7 @@ def _goes_round(path: Path, solution: Solution) -> bool:
 
 
 def _comes_back(apart: np.ndarray, far: float, near: float) -> bool:
-    """True if distances from the last state were small before the last time at which they were large."""
+    """True if the path was close to its last state, then far from it, and came back."""
     away = np.flatnonzero(apart > far)
     return bool(away.size and np.any(apart[: away[-1]] <= near))
 

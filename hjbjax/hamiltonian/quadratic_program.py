@@ -137,7 +137,7 @@ def _derivative(axes: tuple[int, ...], ball: bool, primals: tuple, tangents: tup
     scaled, size, width, met = _scaled(program, ball)
     best = _best(scaled, axes, ball)
     (v, s, slack, dual), stiff = best.point, _stiffness(best.value.dtype)
-    # the changes in the units of the program, which are constants
+    # the changes in the units of the scaled program, which are constants
     slope, bend, rows, offsets = (
         moves.slope / size, moves.bend / size, moves.rows / width[:, None], moves.offsets / width,
     )  # fmt: skip

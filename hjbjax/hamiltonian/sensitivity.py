@@ -120,7 +120,7 @@ def _inputs(player: Player) -> list[Input]:
 
 
 def _implicit(at: Optimum, inputs: Sequence[Input]) -> tuple[Action, Action]:
-    """Both actions with the derivatives of ``inputs``."""
+    """Both actions, with derivatives in the entries of ``inputs``."""
     u, d = at.u, at.d
     if not inputs:
         return u, d

@@ -78,7 +78,7 @@ class Iterate:
       policy: the greedy policy at V with its defect r, zero at fixed nodes.
       equation: its correction equation, whose source is the residual.
       obstacles: fixed nodes and constraints.
-      counted: bool (*grid), the nodes whose error counts (those that reach the target).
+      counted: bool (*grid), the nodes whose error counts (the nodes that reach the target).
     """
 
     layout: Layout

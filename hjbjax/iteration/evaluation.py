@@ -141,7 +141,7 @@ class Krylov(Evaluation):
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """BiCGStab on (I − W) δ = s with one Gauss–Seidel round as preconditioner."""
 
-        def matvec(delta: Field) -> Field:  # (I − W) δ: the residual of a zero right-hand side, negative
+        def matvec(delta: Field) -> Field:  # (I − W) δ: minus the residual for a zero source
             return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
         def precondition(residual: Field) -> Field:

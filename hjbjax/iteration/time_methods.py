@@ -240,7 +240,7 @@ class Explicit(TimeMethod):
         return self.fraction / self.tableau.euler
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Explicit":
-        """The method with the stages of the scheme, if its own are open; its numbers in the dtype of the march."""
+        """The method with the stages of the scheme, unless it has its own; its numbers in the dtype of the march."""
         return Explicit(self.stages or on.scheme.stages, _as(self.fraction, on.dtype))
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
@@ -296,7 +296,7 @@ class Implicit(TimeMethod):
         arguments.count(self.max_steps, "Implicit: max_steps")
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Implicit":
-        """The method with this evaluation, if its own is open; its numbers in the dtype of the march."""
+        """The method with this evaluation, unless it has its own, and its numbers in the dtype of the march."""
         tol = None if self.tol is None else _as(self.tol, on.dtype)
         return Implicit(self.evaluation or evaluation, tol, self.max_steps)
 

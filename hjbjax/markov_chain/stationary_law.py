@@ -7,7 +7,7 @@ entries solve
     (−𝓛*) μ = (rates from k)        without the row and the column k,
 
 an M-matrix that is diagonally dominant by columns, so elimination along the diagonal is stable and free of
-cancellation. Rounding changes μ by at most eps (−𝓛*)⁻¹ |𝓛*| μ, entry by entry to first order, which one more solve
+cancellation. Rounding changes each entry of μ, to first order, by at most eps (−𝓛*)⁻¹ |𝓛*| μ, which one more solve
 evaluates. If this is large, the class is connected by rates hardly larger than rounding, and numerically there are
 several classes. The cost is one or two sparse LU factorisations, as for a stationary solve on the same grid.
 """

@@ -4,8 +4,8 @@ A layout exchanges values between parts and reduces over all nodes. Parts are a 
 ``jax.shard_map``: every device runs the single-device program on its part of the grid. It fetches the nodes just beyond
 its part from the neighbouring parts by ``ppermute`` and reduces by ``pmax`` or ``psum``. The i-th axis of the mesh
 divides the i-th axis of the grid. With N nodes, part k of p has the nodes from ⌊kN/p⌋ up to ⌊(k + 1)N/p⌋, so that parts
-differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node fewer has a filler as its
-last entry, a copy of the next node. No node reads the value computed at a filler, and reductions ignore fillers.
+differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node fewer has a filler as its last
+entry, a copy of the next node. No node reads the value computed at a filler, and reductions ignore fillers.
 """
 
 import dataclasses

@@ -248,7 +248,7 @@ def _until_still(step: Callable, pair: tuple[AtNodes, AtNodes]) -> AtNodes:
 
 
 def without(arcs: Arcs, grid: Grid, counted: Mask) -> Arcs:
-    """The arcs, with infinite cost for those that lead to nodes that do not count."""
+    """The arcs, with infinite cost for arcs to nodes that do not count."""
     lost = widened(jnp.where(counted, 0.0, 1.0).astype(arcs.pay.dtype), grid)
 
     def each(one: Arcs) -> tuple[jax.Array, jax.Array]:

@@ -92,7 +92,7 @@ def solve_batch(
     """Solve many problems on one grid; each solution is the same as from ``solve`` with this method.
 
     Args:
-      problems: problems; those with the same functions and shapes share a program, whatever their numbers.
+      problems: problems; problems with the same functions and shapes share a program, regardless of their numbers.
       grid: the grid.
       method: as in ``solve``, without nesting: ``Nested`` is replaced by its inner method; ``None`` chooses by the
         problem.

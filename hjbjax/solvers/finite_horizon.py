@@ -340,8 +340,8 @@ def _prepare(
     limit: Scalar = jnp.asarray(jnp.inf, dtype)
     method = method.filled(on, march_evaluation(problem, grid, divided=mesh is not None))
     if method.limited:
-        # For functions of time 1/(max Q + β) depends on time. A given step is checked against the least of many values;
-        # otherwise the step is computed before every step.
+        # If functions depend on time, so does the limit 1/(max Q + β). A step that the caller passes is checked against
+        # the limit at many times; otherwise the length is computed before every step.
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
             # the Euler steps inside a stage have length c Δt, and are monotone if c Δt (max Q + β) ≤ 1

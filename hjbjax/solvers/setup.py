@@ -39,7 +39,7 @@ COARSEST = 20_000  # nodes of the coarsest grid: for fewer a step takes under a 
 
 
 def check_on_one_state(problem: Problem, grid: Grid, scheme: object) -> None:
-    """Refuse functions that fail at a single state, and warn of those that take XLA minutes to compile."""
+    """Refuse functions that fail at a single state, and warn of functions that take XLA minutes to compile."""
     checks.shapes(problem, grid, scheme)
     count = checks.operations_of(problem, grid.ndim).single
     if count > OPERATIONS:

@@ -189,8 +189,9 @@ class StationaryRun(StatesInChunks):
     def first_chunk(self, clock: Clock) -> int:
         """Evaluations of the first chunk on this grid, before any is timed there: the guess, and some steps.
 
-        The pace on a coarser grid predicts the steps; a finer one may exceed the cache, so half a chunk's time is
-        planned. There is a single step if steps take many passes over the nodes, and more of them on a finer grid.
+        The number of steps follows from the pace on a coarser grid, for half the time of a chunk, because the finer
+        grid may exceed the cache. If a step takes many passes over the nodes, and more passes on a finer grid, only one
+        step is made.
         """
         evaluation = self.task.method.evaluation
         # the evaluation of the guess is one pass over the nodes, a step with a linear solve hundreds, so it is timed

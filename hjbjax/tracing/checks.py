@@ -77,7 +77,7 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
 
 
 def refuse_prescribed(grid: Grid, name: str, why: str) -> None:
-    """Refuse prescribed ends on behalf of a function, with the reason.
+    """Refuse prescribed ends in a function that does not support them, with the reason.
 
     Raises:
       ValueError: the grid has prescribed ends.

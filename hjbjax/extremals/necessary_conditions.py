@@ -173,7 +173,7 @@ def assemble_extremal(
         parts.append({**part, "t": t, "z": np.concatenate([states, z[bvp.n :].T], 1)})
 
     def join(name: str, last: bool = True) -> np.ndarray:
-        """Join a quantity over all arcs; a switch gets the next arc's entry. Without ``last``, one entry per interval."""
+        """Join a quantity over all arcs; a switch gets the next arc's entry. Without ``last``: one per interval."""
         rows = [part[name][:-1] for part in parts]
         return np.concatenate([*rows, parts[-1][name][-1:]] if last else rows)
 

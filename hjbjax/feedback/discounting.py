@@ -31,7 +31,7 @@ class Weighted:
     name: str
 
     def __call__(self, *arguments: Any) -> Array:
-        """The value at the problem's arguments, with (x, z) in the place of x."""
+        """The value at the problem's arguments, with (x, z) instead of x."""
         problem, place = self.problem, int(self.problem.time_dependent)
         x, z = arguments[place][:-1], arguments[place][-1]
         own = (*arguments[:place], x, *arguments[place + 1 :])

@@ -1,4 +1,4 @@
-"""Payments of a path besides its running cost, stopping, tubes, and the comparison of the cost with V.
+"""The payments of a path in addition to its running cost, stopping, tubes, and a comparison of the cost with V.
 
     cost = ∫ e^{−βt} L dt + e^{−βτ} · { exit cost on the target; ψ where V = ψ; V(T, ·) at the horizon T of a march }
 

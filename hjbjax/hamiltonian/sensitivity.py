@@ -223,7 +223,7 @@ class Kinks:
 
 
 def _kinks(at: Optimum, inputs: Sequence[Input], kinked: Sequence[Any]) -> Kinks:
-    """The kinks of the components that an input drives, for each player separately if their drifts are."""
+    """The kinks of the components that an input drives; for each player if drifts are upwinded separately."""
     driven = {i for each in inputs for i in each.player.driven[each.index]}
     if callable(at.moving.on.problem.noise):  # a may change with an input that does not drive f
         driven = set(range(at.moving.on.grid.ndim))

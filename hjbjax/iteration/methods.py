@@ -68,7 +68,7 @@ class Step(Protocol):
         """r/(Q + β), with the rate of the fastest action: one relaxation of every node, (*grid)."""
 
     def evaluated(self, evaluation: Evaluation, replies: int) -> jax.Array:
-        """The correction that makes V approximately the value of its greedy policy; in a game of the outer player's."""
+        """The correction that makes V approximately the value of its greedy policy; in a game, of the outer policy."""
 
 
 class Method(abc.ABC):

@@ -321,7 +321,7 @@ class Implicit(TimeMethod):
 
 
 def _elapsed(problem: Problem, share: Scalar, length: Scalar, dt: Number) -> tuple[Scalar, Scalar | float]:
-    """The time since a step began at a fraction of its length S in s, and the factor 1/(1 − β s) there."""
+    """τ at a fraction of the step's length S in s, and the factor 1/(1 − β s) there."""
     if problem.discounted is False:
         return share * dt, 1.0
     discount = jnp.asarray(problem.discount, length.dtype)
@@ -461,7 +461,7 @@ class ImplicitStep:
         return dataclasses.replace(policy, defect=jnp.where(self.obstacles.fixed, 0, policy.defect + self.arriving))
 
     def _evaluated(self, value: Field, policy: Greedy, goal: Number, evaluation: Evaluation) -> Field:
-        """The value of the policy, approximately; in a game of the outer player's policy."""
+        """The approximate value of the policy, or of the outer player's policy in a game."""
         if self.on.problem.is_game:
             return methods.evaluated(self, value, policy, evaluation, goal=goal, replies=REPLIES)
         return self.impose(value + evaluate(evaluation, self.equation(value, policy), self.grid))

@@ -163,7 +163,7 @@ def drive(run: Run, clock: Clock) -> Status:
 
 
 def _status_interrupted(run: Run, clock: Clock, interrupt: KeyboardInterrupt) -> Status:
-    """The status of a run that Ctrl-C stopped at any moment.
+    """The status of a run that Ctrl-C stopped, which may happen at any moment.
 
     Raises:
       KeyboardInterrupt: it came between a step, which takes over the memory of the state, and the new state.

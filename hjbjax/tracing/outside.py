@@ -395,7 +395,7 @@ def decisive(jaxpr: jex.Jaxpr, variables: Sequence[jex.Var]) -> set[int]:
 
 
 def _follow(jaxpr: jex.Jaxpr, owners: dict[jex.Var, frozenset[int]]) -> tuple[set[int], list[frozenset[int]]]:
-    """Positions of the decisive variables, and for each output the positions it was made from.
+    """Positions of the decisive variables, and for each output the positions of the variables it depends on.
 
     ``owners``: for each variable that is known before any state, the positions it was made from.
     """

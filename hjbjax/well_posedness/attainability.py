@@ -34,7 +34,7 @@ LOOK = 10**7  # nodes times actions between two checks of the clock: about a sec
 def _open_jumps(
     on: Discretisation, points: Array, count: int, clock: Clock, inside: jax.Array | None, *, least: Number, kinks: bool
 ) -> Rates:
-    """For every jump the nodes, bool (*grid), with an action that makes it and whose jumps all stay ``inside``.
+    """For every jump, the nodes with an action that makes this jump and whose jumps all stay ``inside``, bool (*grid).
 
     Tries the first ``count`` actions of ``points``. ``inside=None`` means the box. Rates up to ``least`` count as
     rounding. With ``kinks``, the actions between samples at which a component of the drift vanishes are tried too.
@@ -236,7 +236,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
     )
     pairs = np.concatenate([np.repeat(u, len(d), axis=0), np.tile(d, (len(u), 1))], axis=1)
     count = len(pairs)
-    if dearest is not None:  # usually few actions are cheap anywhere, and each is tried many times
+    if dearest is not None:  # usually only few actions are cheap at any node, so select them once
         cheap = np.asarray(_cheap_somewhere(on, start, dearest, pairs))
         pairs, count = np.concatenate([pairs[cheap], pairs[~cheap]]), int(np.sum(cheap))
     return _refuge(on, start, dearest, pairs, count)

@@ -80,7 +80,7 @@ def _knows_kinks(on: Discretisation, player: Player) -> bool:
 
 
 def _of_a_ball(on: Discretisation, ball: Ball, player: Player) -> list[list]:
-    """The actions of a ball that go furthest along one input while others let their components vanish.
+    """Actions of a ball with the largest possible |u_k| for one input k, and the others where their components vanish.
 
     Each input u_j drives its own component f_j. Among the actions with given signs of all f_j, the action with the
     largest |f_k| has some inputs S at their kinks, f_S = 0, the other inputs zero, and the remaining radius in u_k.

@@ -155,7 +155,7 @@ def dissipation(
             found.append(_energies_under(problem, solution, given, starts, times, rtol))
         output, total, ends, codes = (np.concatenate(each) for each in zip(*jax.device_get(found), strict=True))
         stored = np.asarray(solution.value_at(starts))
-    count = len(output) // len(starts)  # paths per initial state; all initial states follow under each disturbance
+    count = len(output) // len(starts)  # paths per initial state; each disturbance has one path from every state
     statuses = tuple(PathStatus(int(code)) for code in codes)
     # a path that becomes infinite ends at its last finite state, whose energies do not cover the whole duration
     output = np.where([status is PathStatus.NONFINITE for status in statuses], np.nan, output)

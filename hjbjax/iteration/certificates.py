@@ -158,7 +158,7 @@ def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
         shift = jnp.minimum(shift, obstacles.upper - value)
     if obstacles.lower is not None:
         shift = jnp.maximum(shift, obstacles.lower - value)
-    # at fixed nodes r is zero, the constraints need not be; V is exact there
+    # at fixed nodes V is exact; r is zero there, but ψ − V and g − V may differ from zero
     shift = jnp.where(obstacles.fixed, 0, shift)
     return layout.least(shift), layout.largest(shift)
 

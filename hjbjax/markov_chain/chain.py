@@ -162,8 +162,8 @@ def transition_arrays(
     QuantEcon maximises. ``DiscreteDP(rewards, probabilities, factor, state_index, action_index)`` has the value V_h of
     a problem with rewards, and with ``-costs`` it has the value −V_h of a problem with costs.
 
-    A discount that is a function β(x) of the state counts time by dτ = β(x) dt, in which the discount is one: drift,
-    noise and costs are divided by β, so that one factor serves all states.
+    If the discount is a function β(x) of the state, the arrays use the time τ with dτ = β(x) dt, in which the discount
+    is one. Drift and costs are divided by β and the noise by √β, so that all states have the same factor.
 
     Args:
       problem: discounted, without disturbances or constraints, with K ``Finite`` controls, or None (K = 1).

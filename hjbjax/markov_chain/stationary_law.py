@@ -1,8 +1,8 @@
 """Recurrent classes of a Markov chain and their stationary distributions.
 
 A recurrent class is a set of states that lead to one another and nowhere else. A finite chain has at least one. Its
-stationary law μ is unique if and only if there is only one. On that class, with μ_k = 1 at one state k, the other
-entries solve
+stationary law μ is unique if and only if it has only one recurrent class. On that class, with μ_k = 1 at one state k,
+the other entries solve
 
     (−𝓛*) μ = (rates from k)        without the row and the column k,
 

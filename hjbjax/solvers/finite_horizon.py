@@ -101,7 +101,8 @@ def march(
         of the horizon, and down to a 6400th where they change faster.
       inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops with
         DIVERGED when the worst disturbance reaches that bound in this fraction of the grid's box about its middle,
-        which indicates that the value blows up. ``None`` is 0, never: the bound is part of the problem.
+        which indicates that the value blows up. ``None`` is 0: the bound is part of the problem and never stops the
+        march.
       policy: return the policy with the value; otherwise only V is stored, as in ``ValueIteration(policy=False)``.
       dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
       time_limit: seconds, including checks and compilation.
@@ -115,9 +116,9 @@ def march(
     Returns:
       The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), and similarly the policy. If the march stopped
       early, it contains the kept times that were reached, and the last time reached; after a time limit or Ctrl-C the
-      policy there may be missing, which is NaN. Inside ``jit``, ``vmap`` and ``grad`` the value is traced, and
-      ``horizon``, ``times`` and ``step`` must be known numbers. A step above the stability limit, or any other fault,
-      makes it and its derivatives NaN, unless ``throw=False``.
+      policy at that last time may be missing, that is, NaN. Inside ``jit``, ``vmap`` and ``grad`` the value is traced,
+      and ``horizon``, ``times`` and ``step`` must be known numbers. A step above the stability limit, or any other
+      fault, makes it and its derivatives NaN, unless ``throw=False``.
 
     Raises:
       ValueError: an argument is invalid, or the step is above the stability limit.

@@ -350,7 +350,7 @@ def _least_rate(task: Task) -> Number:
 
 
 def _finite_part(task: Task, reached: Mask) -> Task:
-    """The task on the nodes with a finite value; the others get a larger value, so that no optimal action leads there."""
+    """The task on the nodes with a finite value; other nodes get a larger value, so no optimal action leads there."""
     obstacles = dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | ~jnp.asarray(reached))
     return dataclasses.replace(task, obstacles=obstacles, counted=task.counted & jnp.asarray(reached), has_lost=True)
 

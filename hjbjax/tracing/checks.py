@@ -149,7 +149,7 @@ def call(problem: Problem, name: str) -> str:
 
 
 def _names(problem: Problem, name: str) -> tuple[str, ...]:
-    """The arguments that the problem passes to one of its functions, by letters."""
+    """The arguments that the problem passes to one of its functions, as letters."""
     if name in OF_ACTION:
         return problem.arguments("x", "u", "d", "t")
     return problem.state_arguments("x", "t")

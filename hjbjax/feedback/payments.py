@@ -175,7 +175,7 @@ def _rests(path: Path, grid: Grid) -> bool:
 
 
 def _goes_round(path: Path, solution: Solution) -> bool:
-    """True if a path returns to an earlier state in its second half, and V has fallen in between by no more than its error."""
+    """True if a path returns to an earlier state in its second half, and V fell in between by at most its error."""
     grid, late = solution.grid, path.states[len(path.states) // 2 :]
     value = solution.value_at(late, clamp=True)
     if not value[0] - value[-1] <= _grid_error(solution):

@@ -157,7 +157,7 @@ class Seen:
     Args:
       fastest: the largest Q + β under the chosen actions, per unit time.
       lacking: the flat index of the first node where noise is correlated more than the spacings allow, or −1.
-      t: the time of that.
+      t: the time at which this noise was found.
       cut: the number of nodes at each end of the box where drift is cut off, (n, 2).
     """
 

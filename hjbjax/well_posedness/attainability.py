@@ -164,10 +164,10 @@ def _reached_by(open_jumps: Callable[..., Rates], held: np.ndarray, surely: bool
 def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock) -> np.ndarray:
     """The nodes of a game from which the control reaches the fixed nodes surely, whatever the disturbance does.
 
-    This is the largest set R in which some control keeps all jumps inside under every disturbance and leads to a nearer
-    node; in a lower game, for every disturbance there is some control. A continuum is sampled by few actions. Arguments
-    as for ``reached``. Takes one step per cell of the longest path, each over all pairs of actions, so use it for
-    failing games.
+    This is the largest set R in which some control keeps all jumps inside R and leads to a nearer node under every
+    disturbance. In a lower game the control may depend on the disturbance. A continuum is sampled by few actions.
+    Arguments as for ``reached``. Takes one step per cell of the longest path, each over all pairs of actions, so use it
+    for failing games.
     """
     found, on = np.ones(on.grid.shape, bool), on.on_grid(stencil.walled(on.grid))
     while True:

@@ -219,7 +219,7 @@ def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bo
             parts = [outside, jax.lax.slice_in_dim(values, 0, grid.shape[axis] - 1, axis=axis)]
         else:
             parts = [jax.lax.slice_in_dim(values, 1, grid.shape[axis], axis=axis), outside]
-        moved = jnp.concatenate(parts, axis=axis)  # fused, while a pad would fill an array
+        moved = jnp.concatenate(parts, axis=axis)  # XLA fuses this, but stores an array for a pad
         if step > 0 and not grid.layout.even(axis):
             # the last entry may be padding of this part, and the one before it the last node
             place = jnp.arange(grid.shape[axis]).reshape([-1 if i == axis else 1 for i in range(grid.ndim)])

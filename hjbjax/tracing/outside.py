@@ -1,8 +1,8 @@
 """Find the data that a function reads from outside, to recognise equal functions and to turn numbers into arguments.
 
 A lambda in a loop, or a notebook cell that runs again, makes a new function with the same code. Two functions compute
-the same result if their code and the data that it reads are the same. If functions were compared by identity, each new
-one would cost seconds of compilation.
+the same result if they have the same code and this code reads the same data. If functions were compared by identity,
+each new one would cost seconds of compilation.
 
 ``for mass in masses: solve(Problem(lambda x, u: u / mass, ...), grid)`` would still compile a program for every mass,
 because a number that a function closes over is part of its computation. The numbers in cells and globals are therefore

@@ -1,10 +1,11 @@
 """The nodes from which the target can be reached with certainty, from the graph of the chain.
 
 Without discount the value is finite at a node if and only if some policy (a proper policy) reaches the fixed nodes from
-there with probability one. The largest such set R is a fixed point: remove the nodes without a path of jumps to the
-target by actions that keep every jump inside R, until nothing changes. The jumps of sampled actions are computed on the
-device. The paths are followed on the host by sweeps: one cumulative "or" along an axis follows all jumps in one
-direction to their end, so two or three rounds of sweeps usually find every path, however long.
+there with probability one. The set R of these nodes is a largest fixed point: start with all nodes, and remove the
+nodes without a path of jumps to the target by actions that keep every jump inside R, until nothing changes. The jumps
+of sampled actions are computed on the device. The paths are followed on the host by sweeps: one cumulative "or" along
+an axis follows all jumps in one direction to their end, so two or three rounds of sweeps usually find every path,
+however long.
 """
 
 import functools

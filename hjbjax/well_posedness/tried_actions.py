@@ -80,7 +80,7 @@ def _knows_kinks(on: Discretisation, player: Player) -> bool:
 
 
 def _of_a_ball(on: Discretisation, ball: Ball, player: Player) -> list[list]:
-    """Actions of a ball with the largest possible |u_k| for one input k, and the others where their components vanish.
+    """The actions of a ball in which some inputs let their components vanish and one input is as large as possible.
 
     Each input u_j drives its own component f_j. Among the actions with given signs of all f_j, the action with the
     largest |f_k| has some inputs S at their kinks, f_S = 0, the other inputs zero, and the remaining radius in u_k.

@@ -1,10 +1,11 @@
 """Neighbours and one-sided differences on a grid, with ghost cells.
 
-An end that is neither periodic nor open is a wall through its last node. For drift, the value beyond is a copy of the
-node, so the one-sided difference is zero and outward drift is projected onto the box. For noise it is the mirror image,
-V_{N+1} = V_{N−1}: a reflected path has ∂V/∂n = 0 there, which an even extension satisfies to second order, while the
-copy would move the wall outwards by half a spacing. Beyond an open end the value is extrapolated by the parabola
-through the last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} for equal spacings.
+An end is a wall through its last node, unless V continues beyond it: at open, linear, Neumann and Robin ends. For
+drift, the value beyond is a copy of the node, so the one-sided difference is zero and outward drift is projected onto
+the box. For noise it is the mirror image, V_{N+1} = V_{N−1}: a reflected path has ∂V/∂n = 0 there, which an even
+extension satisfies to second order, while the copy would move the wall outwards by half a spacing. Beyond an open end
+the value is extrapolated by the parabola through the last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} for equal
+spacings. ``continuation`` has the weights for all these ends.
 
 If the nodes are divided among several devices, the values beyond the last node of a part are fetched from the adjacent
 part: see ``problem.layouts``.

@@ -208,7 +208,8 @@ def _status_after(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar)
 def arriving(arcs: Arcs, grid: Grid, held: Mask, inside: AtNodes | None = None) -> AtNodes:
     """The nodes from which some choice of arcs may reach the target without leaving ``inside``, bool (*grid).
 
-    An arc qualifies if it ends on the target, or in a cell whose corners are all inside and one of which qualifies.
+    The last arc ends on the target. Every other arc ends in a cell whose corners are all inside and one of which is
+    such a node.
     """
     zero = jnp.zeros(grid.shape, arcs.pay.dtype)
     outside = widened(zero if inside is None else zero + ~inside, grid)

@@ -314,7 +314,7 @@ def _short_enough(
     endless = dataclasses.replace(nothing, fastest=jnp.full_like(nothing.fastest, jnp.inf))
     start = (count, jnp.zeros((), jnp.int32), front.value, endless)
     carry = jax.lax.while_loop(too_long, attempt, start)
-    # with tries reset: true if the last attempt was short enough, false if the attempts ran out
+    # tries = 0 here: true if the last attempt was short enough, false if the attempts ran out
     return carry[2], _moved(front, until, carry[0])[1:], ~too_long((carry[0], 0, *carry[2:])), carry[3]
 
 

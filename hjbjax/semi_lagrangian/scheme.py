@@ -38,12 +38,14 @@ class SemiLagrangian(Scheme, Paths):
 
     From each node the scheme tries arcs across 1, about √``cells`` and ``cells`` cells, each under one constant action.
     V_h is the fixed point of the minimum over these arcs, which form a Markov chain with long jumps. The certificates
-    are the same as for ``Upwind``, with jumps instead of rates. With a discount they are V + min r/(1 − e^{−βτ}) ≤ V_h
-    ≤ V + max r/(1 − e^{−βτ}), and without V/(1 + max(−r/c)) ≤ V_h ≤ V/(1 − max(r/c)). Here r is the cost of an arc
-    minus V, and c is its running cost. The lower bound uses all arcs, the upper bound the best arc from each node. The
-    scheme is first order in general. Where V has kinks the error is far smaller than with ``Upwind``: seven times in
-    the mean for the double integrator's minimum time. The boundary of a target is where its l is zero, also between
-    nodes. A target of a single node is reached through interpolation.
+    are the same as for ``Upwind``, with jumps instead of rates, with a discount and without:
+
+        V + min r/(1 − e^{−βτ}) ≤ V_h ≤ V + max r/(1 − e^{−βτ}),        V/(1 + max(−r/c)) ≤ V_h ≤ V/(1 − max(r/c)).
+
+    Here r is the cost of an arc minus V, and c is its running cost. The lower bound uses all arcs, the upper bound the
+    best arc from each node. The scheme is first order in general. Where V has kinks the error is far smaller than with
+    ``Upwind``: seven times smaller in the mean for the double integrator's minimum time. The boundary of a target is
+    where its l is zero, also between nodes. A target of a single node is reached through interpolation.
 
     The minimum is over these arcs only. The actions of a ``Finite`` set are its elements. If drift and cost are affine
     in the control, the actions are the corners of a box, or about ``actions`` directions on the boundary of a ball.

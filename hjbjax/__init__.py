@@ -4,7 +4,7 @@ import sys
 
 from hjbjax._version import __version__ as __version__
 
-TYPE_CHECKING = False  # True for type checkers, as in typing, which takes 10 ms to import
+TYPE_CHECKING = False  # True for type checkers; the constant of typing would take 10 ms to import
 
 if TYPE_CHECKING:
     from typing import Any
@@ -32,7 +32,7 @@ def __getattr__(name: str) -> "Any":
             return found
         if name in globals():  # a subpackage that has been imported meanwhile
             return globals()[name]
-    # with the name, from which Python derives its suggestion
+    # with ``name=``, from which Python derives its suggestion
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
 

@@ -1,4 +1,4 @@
-"""The command ``hjbjax``, also as ``python -m hjbjax``: all that has to be done before anything is imported."""
+"""The command ``hjbjax``, also as ``python -m hjbjax``. This file does what must precede all other imports."""
 
 import os
 

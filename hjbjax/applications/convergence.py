@@ -85,7 +85,7 @@ class Study:
 
     @property
     def fitted(self) -> np.ndarray:
-        """A mask of the grids that count for the orders: those that converged with an error above the tolerance."""
+        """A mask of the grids that count for the orders: grids that converged with an error above the tolerance."""
         converged = np.array([status is Status.CONVERGED for status in self.statuses])
         # a smaller error may come from the iteration instead of the grid
         return converged & np.isfinite(self.errors) & (self.errors > self.tol)
@@ -143,7 +143,7 @@ class Study:
         what = "estimated" if self.estimated else "largest"
         lines = [f"{self.scheme}, tol {self.tol:g}; error against {self.reference}"]
         lines.append(f"{'grid':>14} {'h':>9} {what:>11} {'order':>6} {'mean':>10} {'order':>6}  seconds  first  status")
-        # an order belongs to the step between two grids, and is in the row of the finer one
+        # an order belongs to two successive grids; the table shows it in the row of the finer grid
         orders, means = (["", *map(_order, steps)] for steps in (self.orders, self.mean_orders))
         for k, grid in enumerate(self.grids):
             lines.append(
@@ -178,8 +178,9 @@ def convergence_study(
       problem: the problem.
       grids: at least two grids of the same box in any order, refined by the same factor along every axis.
       reference: the value as a function of one state, or a converged ``Solution`` on a finer grid, interpolated
-        linearly between its nodes. ``None`` uses Richardson's estimate from the three finest grids; the intervals of
-        all grids must then be multiples of those of the coarsest grid, as with 41, 81 and 161 nodes.
+        linearly between its nodes. ``None`` uses Richardson's estimate from the three finest grids. The number of
+        intervals of every grid must then be a multiple of the number on the coarsest grid, as with 41, 81 and 161
+        nodes.
       scheme: as in ``solve``.
       method: as in ``solve``.
       tol: as in ``solve``; it must be small, so that errors come from the grid and not from the iteration.
@@ -207,7 +208,7 @@ def convergence_study(
     if is_traced(problem, grids, reference):  # seconds, statuses and masks must be concrete
         raise ValueError("convergence_study: it runs at host level only, outside of jit, vmap and grad")
     ordered = _sort(grids)
-    check_reference(reference, ordered)  # before any solve, whose time an error would waste
+    check_reference(reference, ordered)  # before any solve, because a late error would waste the time of the solves
     compared = ordered if reference is not None else ordered[:1] * len(ordered)  # the estimate is on the coarsest grid
     masks = [mask_of(region, grid) for grid in compared]
     # evaluate the reference before the first solve, so that a bad reference is refused at once
@@ -245,7 +246,7 @@ def convergence_study(
         reference=words,
         estimated=reference is None,
         h=h,
-        # max instead of nanmax, so that a node without a value shows and excludes its grid from the fit
+        # max instead of nanmax, so that a node without a value gives NaN and excludes its grid from the fit
         errors=np.array([np.max(each) for each in off]),
         mean_errors=np.array([np.mean(each) for each in off]),
         seconds=np.array([warm for _, _, warm in timed]),

@@ -3,8 +3,9 @@
     P(x) = opt E 1{x(τ) in the target, not in the obstacle},      T(x) = opt E τ,       τ = first time in either
 
 P solves the problem's equation without running cost, with the exit cost one on the target and zero on the obstacle. T
-solves it with running cost 1. As everywhere, the control minimises and the disturbance maximises, so a greatest
-probability or time is minus the value for the opposite cost. A given feedback closes the loop and removes the controls.
+solves it with running cost 1. The control always minimises and the disturbance maximises. The greatest probability or
+time is therefore minus the value of a problem with the opposite cost. A given feedback closes the loop and removes the
+controls.
 """
 
 from collections.abc import Callable
@@ -91,8 +92,8 @@ def close_loop(problem: Problem, feedback: GridFeedback | Callable, horizon: Num
         marched, look = problem.time_dependent, as_partial(feedback)
     assert look is not None
     loop = ClosedLoop(problem, look, marched, marched or problem.time_dependent)
-    # where a Solution is NaN the state must not move, even with noise; a function always gives a control, so a constant
-    # noise stays as it is
+    # where a Solution is NaN the state must not move, so the noise is zero there; a function always gives a control, so
+    # a constant noise need not change
     looped = problem.noise is not None and (is_grid_feedback(feedback) or callable(problem.noise))
     return Problem(
         # no cost and no controls; the disturbance plays against the closed loop
@@ -184,7 +185,7 @@ def _control(look_up: Callable, *where: Place) -> Array:
 
 def _constant(value: Number, *arguments: Array) -> jax.Array:
     """A constant cost per unit time."""
-    # the default dtype, float64 only if enabled, so that a float32 solve is not promoted
+    # the default dtype, which is float64 only if that is enabled, so that a float32 solve is not promoted
     return jnp.asarray(value, jnp.result_type(float))
 
 
@@ -195,7 +196,7 @@ def _nearest(sets: tuple[Callable, ...], *where: Place) -> jax.Array:
 
 
 def _exit_cost(amount: Number, sets: tuple[Callable, ...], *where: Place) -> jax.Array:
-    """The amount if the path ends in the target; between nodes, the nearer set is the one that the path met."""
+    """The amount if the path ends in the target; between nodes, the path is taken to end in the nearer set."""
     if len(sets) == 1:
         return jnp.asarray(amount, jnp.result_type(float))
     inside, hit = (jnp.asarray(each(*where)) for each in sets)

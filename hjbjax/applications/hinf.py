@@ -12,26 +12,26 @@ A bounded set of disturbances makes V finite for every γ, so infeasible levels 
 starts from V = 0. Its value V_T for the horizon T increases with T, because d = 0 is allowed and costs nothing, and its
 limit is V. So γ is feasible if and only if V_T stays bounded. There are three outcomes:
 
-* V_T settles in an inner box and in the whole box, and no d in the inner box is at its bound: feasible. Settled means
-  that the growth from T to 2T is below a small fraction, or below ten times this fraction and a third of the growth
-  before.
-* The worst disturbance reaches its bound in the inner box. The set then hides growth without bound: infeasible.
-* V_T still grows at the horizon, because the worst disturbance keeps the state where it gains at a constant rate, or
-  because growth is slow near the level. This γ is not shown to be feasible.
+* V_T settles in an inner box and in the whole box, and no d in the inner box is at its bound: feasible. V_T has settled
+  if its growth from T to 2T is below a small fraction. It has also settled if the growth is below ten times this
+  fraction and below a third of the previous growth.
+* The worst disturbance reaches its bound in the inner box. The set then hides unbounded growth: infeasible.
+* V_T still grows at the horizon, because the worst disturbance keeps the state where V grows at a constant rate, or
+  because growth ends slowly near the level. This γ is not shown to be feasible.
 
 The whole box counts because a nonlinear plant may have its largest gain away from the rest point. V near the rest point
-then stays on a plateau until the worst path has reached that place, and the plateau does not show for how long. The
+then stays on a plateau until the worst path has reached that place. The plateau does not show how long this takes. The
 level therefore depends on the box; use a smaller box for a local level. Because a plateau may end late, the marches for
 the reported γ, and for a ``lo`` that has settled, continue to the horizon.
 
 Doubling T makes the rule independent of the unit of time: a constant rate gives a growth of one half. At the level
 itself V_T approaches a finite P like 1/T, so the growth halves per doubling. Above the level it falls faster. Below the
-level, behind a bottleneck, it falls more slowly and then rises. The factor of a third separates the cases earlier than
-waiting until V has settled: with a time constant τ of the closed loop, a relative error e of the level shows at a T of
-about τ/√e. Narrow sets of controls or disturbances, a small grid and a short horizon make the level too high, and so do
-coarse grids if P grows without bound at the level. ``Weno5()`` is exact on quadratics and depends least on the boundary
-of the grid. Sources: A. van der Schaft, L₂-gain and passivity techniques in nonlinear control; T. Başar and
-P. Bernhard, H∞-optimal control and related minimax design problems.
+level, behind a bottleneck, it falls more slowly and then rises. The factor of a third decides earlier than waiting
+until V stops growing. If τ is the time constant of the closed loop, a relative error e of the level is detected at
+about T = τ/√e. Narrow sets of controls or disturbances, a small grid and a short horizon make the level too high, and
+so do coarse grids if P grows without bound at the level. ``Weno5()`` is exact on quadratics and depends least on the
+boundary of the grid. Sources: A. van der Schaft, L₂-gain and passivity techniques in nonlinear control; T. Başar and P.
+Bernhard, H∞-optimal control and related minimax design problems.
 """
 
 import dataclasses
@@ -57,7 +57,7 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers.finite_horizon import march_part
 
-DOUBLINGS = 6  # at most, so the first march covers a 64th of the horizon
+DOUBLINGS = 6  # at most this number, so the first march covers a 64th of the horizon
 SOON = 1e-6  # seconds: a time limit that ends a march after its initial evaluation
 CUTS = {Status.INTERRUPTED: "interrupted", Status.TIME_LIMIT: "out of time"}
 CLOSE, FALL = 10.0, 1 / 3  # growth below CLOSE * settle counts as settled if it fell by FALL; at the level it halves
@@ -123,7 +123,7 @@ def hinf_level(
 
     Raises:
       ValueError: not 0 < lo < hi; ``lo`` is feasible or ``hi`` infeasible; the problem has no disturbances, or has a
-        discount, a target or another part with which V does not show a gain.
+        discount, a target or another part that makes V differ from a gain.
       TypeError: ``problem_of_gamma`` does not return a problem.
       SolveError: the search was interrupted, or a march ran out of time; ``.solution`` is the Level so far, with the
         bracket and all trials, including the one of the unfinished march.
@@ -341,7 +341,7 @@ def _check_rule(make: object, lo: float, hi: float, tol: float, settling: Settli
 
 
 def _check_problem(problem: object, gamma: float) -> None:
-    """Raise if V of the problem does not show a gain."""
+    """Raise if the value of the problem is not determined by a gain."""
     if not isinstance(problem, Problem):
         raise TypeError(f"hinf_level: problem_of_gamma({gamma:g}) returned {problem!r:.60}, wanted a Problem")
     refuse_rewards(problem, "hinf_level", "V shows a gain by the energy of an output, which is a cost")

@@ -2,8 +2,8 @@
 
     ẋ = f(x, u) + E d,   cost L(x, u) − ½γ²|d|²,   L = ½|z|²
 
-where z is the output to be kept small. The equation has no bound on d, but a grid requires a bounded set, which must be
-wide enough to be inactive. ``saturation`` checks this.
+where z is the output to be kept small. The equation has no bound on d, but a solve requires a bounded set. The set must
+be so wide that its bound is not active. ``saturation`` checks this.
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ def attenuation(
       enters: E, shape (n, l), or a function of the state that returns it; ``None``: d is added to the drift.
 
     Returns:
-      The game. The disturbance knows the control, which makes no difference here.
+      The game. The disturbance chooses after the control, which makes no difference here.
 
     Raises:
       ValueError: the problem has disturbances or no cost, or the level is not positive.
@@ -150,7 +150,7 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
         raise ValueError(f"saturation: got inner = {inner!r}; wanted a share of the box in (0, 1]")
     # the earliest time of a march, where the worst case has the longest time ahead
     d = np.asarray(solution.disturbance if solution.times is None else solution.disturbance[0], np.float64)
-    # nodes without a disturbance, such as those of a target, do not count
+    # nodes without a disturbance, for example in a target, do not count
     inside = solution.grid.inner(inner) & np.all(np.isfinite(d), axis=-1)
     if not inside.any():
         raise ValueError(f"saturation: no node with a disturbance in the inner {inner:g} of the box; enlarge it")

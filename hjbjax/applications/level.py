@@ -98,8 +98,8 @@ class Level:
     def saturated(self) -> float:
         """The largest γ that is infeasible because a disturbance reached its bound, not because V grew; 0 if none.
 
-        If it is the lower end of the bracket, the level may be a property of the plant or of the sets: where V grows
-        without bound at the level, disturbances of any size saturate just above it.
+        If it is the lower end of the bracket, the level may be due to the plant or to the sets. If V is unbounded at
+        the level itself, any set of disturbances saturates just above the level.
         """
         return max((trial.gamma for trial in self.trials if trial.reason == "saturated"), default=0.0)
 
@@ -124,8 +124,8 @@ class Level:
 def comes_back(problem: Problem, solution: Solution, inner: float, duration: float) -> bool:
     """True if all paths from the corners of the inner box stay in the box and end closer together than they began.
 
-    No rest point is needed. If the box contains one, an unstable mode leaves the box or keeps the paths apart, and a
-    neutral mode keeps their distance constant.
+    No rest point is needed. An unstable mode in the box would make paths leave it or keep them apart, and a neutral
+    mode would keep their distance constant.
 
     Args:
       problem: the game; its disturbance is set to zero.

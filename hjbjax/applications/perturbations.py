@@ -123,7 +123,7 @@ def perturbation_study(
     """Solve a problem with vanishing noise and with expensive disturbances, and fit the orders of the changes.
 
     Args:
-      problem: a problem without noise and disturbances, and with a discount, because noise costs without end.
+      problem: a problem without noise and disturbances, and with a discount, because the cost of noise never ends.
       grid: the grid of all solves.
       noises: ε, at least two numbers > 0.
       gammas: γ, at least two feasible levels.
@@ -156,7 +156,7 @@ def perturbation_study(
     levels = _parameters("noises", noises), _parameters("gammas", gammas)
     if problem.is_game or problem.noise is not None:
         raise ValueError("perturbation_study: the problem already has noise or disturbances; remove them")
-    # noise never lets the state rest, so the running cost continues indefinitely and only a discount makes it finite
+    # with noise the state never rests, so the running cost continues indefinitely and is finite only with a discount
     if not is_discounted(problem):
         raise ValueError("perturbation_study: without a discount the cost with noise is infinite; give a discount > 0")
     mask = mask_of(region, grid, "perturbation_study")
@@ -188,8 +188,8 @@ def perturbation_study(
     if clock.interrupted:
         came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
         raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
-    # if the strongest worst case, at the lowest level, does not reach its bound, none does; the region need not be a
-    # box, so the disturbance is masked outside it and inner=1
+    # the worst case is strongest at the lowest level: if it does not reach its bound, no other does; the region need
+    # not be a box, so the disturbance is masked outside it and inner=1
     watched = dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask))
     felt = saturation(watched, games[-1], inner=1.0)
     if felt.share > 0:
@@ -215,7 +215,7 @@ def _disturbance_within(solution: Solution, mask: Mask) -> np.ndarray:
 def _series(
     name: str, parameters: np.ndarray, solutions: Sequence[Solution], nominal: Solution, mask: Mask, tol: float
 ) -> Series:
-    """The changes relative to the unperturbed solution, and masks of those that count for the orders."""
+    """The changes relative to the unperturbed solution, and masks of the changes that count for the orders."""
     parameters = parameters[: len(solutions)]  # fewer if the study was interrupted
     # on one grid with one scheme the discretisation error cancels up to its product with the change
     values = [np.abs(each.value - nominal.value)[mask] for each in solutions]
@@ -226,7 +226,7 @@ def _series(
     converged = np.array([each.status is Status.CONVERGED for each in solutions], bool)
     # a smaller change may come from the iteration
     fitted = converged & np.isfinite(errors) & (errors > tol)
-    # the smallest spacing, where an error of V causes the largest error of its slope
+    # the smallest spacing, because an error of V causes the largest error of its slope there
     finest = min(float(nominal.grid.spacing(axis)) for axis in range(nominal.grid.ndim))
     seen = fitted & (feedback > tol / finest)  # a slope of V is not more accurate than this
     return Series(name, parameters, errors, feedback, tuple(solutions), fitted, seen)

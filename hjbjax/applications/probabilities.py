@@ -1,9 +1,9 @@
 """Probabilities and exit times: ``reach_probability``, ``stay_probability``, ``expected_exit_time``.
 
-They call ``solve`` and ``march`` with the problems of ``exit_problems``. Over all times without a discount the equation
-has several solutions if the chain may stay away indefinitely. Value iteration from zero then finds the least solution,
-which is the probability. If every pair of actions must end, any method finds it. On the host the chain is checked for
-this. Inside jit, vmap and grad it is not checked, and every pair is assumed to end.
+They call ``solve`` and ``march`` with the problems of ``exit_problems``. Without a horizon the undiscounted equation
+has several solutions if the chain may stay away from the ends indefinitely. Value iteration from zero then finds the
+least solution, which is the probability. If every path must end under all actions, any method finds it. On the host the
+chain is checked for this. Inside jit, vmap and grad it is not checked, and every path is assumed to end.
 """
 
 import contextlib
@@ -53,11 +53,11 @@ def reach_probability(
     """Compute the greatest probability with which the control can bring the state into the target.
 
     V(x) = sup_u inf_d P(x(τ) in the target, τ ≤ horizon), where τ is the first time in the target or in the obstacle.
-    It solves min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. The order of
-    accuracy and the cost are those of ``march``, or of ``solve`` without a horizon. There is no certificate. If the
-    state may stay away from both sets indefinitely, the equation has several solutions, and value iteration from zero
-    finds the probability, which is slower. It stops at a step of at most 1e-9 (4e-6 in float32); the error may be
-    larger if steps shrink slowly.
+    It solves min max (V_t + f·DV + ½ tr σσᵀD²V) = 0 with V = 1 on the target and 0 on the obstacle. Accuracy and run
+    time are as for ``march``, or as for ``solve`` without a horizon. There is no certificate. If the state may stay
+    away from both sets indefinitely, the equation has several solutions. Value iteration from zero then finds the
+    probability, but takes longer. It stops at a step of at most 1e-9 (4e-6 in float32); the error may be larger if
+    steps shrink slowly.
 
     Without noise the probability is 0 or 1, and is derived from a minimum time or from a tube. If ``scheme`` or
     ``method`` is passed, or ``least`` together with ``obstacle``, it is instead the probability of the Markov chain,
@@ -101,7 +101,7 @@ def reach_probability(
     problem, inside, hit = _system(problem, target, obstacle, feedback, horizon, name)
     if _has_no_chance(problem, options):
         decides = least and (problem.is_game or problem.controls is not None)
-        # avoiding the target with an obstacle is not a tube
+        # avoiding the target is not a tube if there is an obstacle
         if not (decides and hit is not None):
             with _no_fallback_warning(feedback):
                 return _yes_or_no(problem, grid, (inside, hit), horizon, options, least=decides)
@@ -158,7 +158,7 @@ def stay_probability(
     # P(stays) = 1 − P(leaves), also for a partial solution; the least P(leaves) is the greatest P(stays)
     with _map_errors(1.0, -1.0):
         left = reach_probability(problem, grid, leaving, horizon=horizon, least=not least, feedback=feedback, **options)
-    # the policy is the same, because it minimises P(leaves) exactly when it maximises P(stays)
+    # the policy is the same, because minimising P(leaves) is maximising P(stays)
     return _affine(left, 1.0, -1.0)
 
 
@@ -177,7 +177,7 @@ def expected_exit_time(
 
     V(x) = inf_u sup_d E τ, where τ is the first time in the target: min max (1 + f·DV + ½ tr σσᵀD²V) = 0, V = 0 on the
     target. The bound on |V − V_h| is certified, except for the greatest time. Without noise and disturbance, scheme and
-    certificate are those of ``solve``, unless ``scheme`` or ``method`` is passed.
+    certificate are as for ``solve``, unless ``scheme`` or ``method`` is passed.
 
     Args:
       problem: the system; its costs and its discount are ignored.
@@ -214,11 +214,11 @@ def expected_exit_time(
         if horizon is None:
             # the user's options take precedence; march has no tolerance
             options = {"tol": TOL} | options
-            # an infinite least time is found; the greatest time would grow without end
+            # an infinite least time is found; the greatest time would grow indefinitely
             if greatest:
                 _refuse_staying(question, grid, options)
             elif _has_no_chance(problem, options) and not problem.is_game:
-                options = {"scheme": None} | options  # a scheme for deterministic paths; the chain may miss the target
+                options = {"scheme": None} | options  # for deterministic paths; the chain may miss the target
         return _answer(question, grid, horizon, options, sign)
 
 
@@ -278,7 +278,7 @@ def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> t
     if not _count_staying(question, grid, options):
         # no node can stay away, so the solution is unique and any method finds it
         return question, options
-    # P is never below zero and −P never above zero, so the bound does not change the value
+    # P is at least zero and −P at most zero, so the bound does not change the value
     bound: dict[str, Any] = {"running_max" if least else "stopping_cost": jax.tree_util.Partial(_zero)}
     # another method may find another solution; a method that the caller passes is used all the same
     return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
@@ -302,7 +302,7 @@ def _yes_or_no(
         question, is_one = exit_problems.arrival(problem, *sets), _is_finite
     else:
         question, is_one = exit_problems.tube(problem, *sets, least=least), _above if least else _below
-    # warnings about that question, such as infinite times, do not apply to the probability
+    # warnings about the auxiliary problem, such as infinite times, do not apply to the probability
     with keeping_warnings(), _map_partial(lambda partial: _decided(partial, is_one)):
         found = solve(question, grid, **options) if horizon is None else march(question, grid, horizon, **options)
     return _decided(found, is_one)
@@ -348,7 +348,8 @@ def _count_staying(question: Problem, grid: Grid, options: dict) -> int:
     # the values of traced functions are unknown; see the module docstring
     if is_traced(question, grid):
         return 0
-    method = options.get("method") or ValueIteration()  # takes the least memory; solve checks its own method again
+    # without a method, the one that takes the least memory; ``solve`` checks the memory of the method that it uses
+    method = options.get("method") or ValueIteration()
     with own_settings(x64=kind == np.float64):
         memory.require(question, grid, method, kind, options.get("max_memory"))
         checks.shapes(question, grid, scheme)

@@ -4,7 +4,7 @@
     avoid:        V = min_u max_d max_s −l(x(s)),                     the disturbance can force a hit from {V ≥ 0}
     reach-avoid:  V = min_u max_d min_s max{l(x(s)), max_{r ≤ s} −o(x(r))},  reach without touching o from {V ≤ 0}
 
-with s over [0, T] for a tube and s = T for a set. As everywhere, the control minimises and the disturbance maximises.
+with s over [0, T] for a tube and s = T for a set. The control always minimises and the disturbance maximises.
 The part of a target that an obstacle covers does not count. The value inherits the range of l, and its zero level does
 not depend on the scale of l. ``march`` solves the problems over a horizon, ``solve`` for all times (tubes only).
 Source: I. M. Mitchell, A. M. Bayen and C. J. Tomlin, A time-dependent Hamilton–Jacobi formulation of reachable sets
@@ -33,7 +33,7 @@ def reach(
     disturbances: AdmissibleSet | None = None,
     tube: bool = True,
     forward: bool = False,
-    isaacs: str = "upper",  # the disturbance knows the control, so the set is what the control can guarantee
+    isaacs: str = "upper",  # the disturbance chooses after the control, so the set is what the control can guarantee
     time_dependent: bool = False,
 ) -> Problem:
     """Construct the problem whose {V ≤ 0} contains the states that the control can bring into the target.
@@ -96,8 +96,8 @@ def avoid(
       The problem; −V is the least distance that the control can guarantee.
     """
     depth = jax.tree_util.Partial(_negative, _distance(obstacle, "avoid: obstacle"))
-    # −l is largest where the path is deepest in the obstacle, and the running maximum stores it, so V ≥ −l; for a set
-    # only the end counts
+    # −l is largest where the path is deepest in the obstacle. For a tube the running maximum records it, so V ≥ −l; for
+    # a set only the end counts
     most, end = (depth, None) if tube else (None, depth)
     return Problem(
         _drift(drift, forward, time_dependent), None, controls, disturbances=disturbances, running_max=most,
@@ -150,9 +150,9 @@ def reach_avoid(
 def from_hj_reachability(dynamics: Any, distance: Callable, *, tube: bool = True) -> Problem:
     """Convert a ``Dynamics`` object of the package hj_reachability to a reachability problem, according to its modes.
 
-    A control that minimises gives ``reach``. A control that maximises gives ``avoid``, whose V has the opposite sign of
-    theirs. A disturbance set with one point becomes a constant. A disturbance that helps the control becomes a part
-    of the control.
+    A control that minimises gives ``reach``. A control that maximises gives ``avoid``, whose V is minus the value of
+    hj_reachability. A disturbance set with one point becomes a constant. A disturbance that helps the control becomes a
+    part of the control.
 
     Args:
       dynamics: called with (state, control, disturbance, time); it has ``control_mode``, ``disturbance_mode``,

@@ -136,7 +136,7 @@ def mask_of(region: Callable | float | None, grid: Grid, name: str = "convergenc
 
 def is_nested(fine: Grid, coarse: Grid) -> bool:
     """True if every node of the coarse grid is a node of the fine grid; both have the same box."""
-    # intervals instead of nodes, so that the rule also holds for periodic axes, which have the same number of both
+    # intervals instead of nodes, so that the rule also holds for periodic axes, which have as many intervals as nodes
     multiple = all(fine.intervals(axis) % coarse.intervals(axis) == 0 for axis in range(coarse.ndim))
     return multiple and repr(fine.stretch) == repr(coarse.stretch)
 
@@ -153,7 +153,7 @@ def strides(fine: Grid, coarse: Grid) -> tuple[slice, ...]:
 
 def at_shared_nodes(value: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
     """The values at the nodes that both grids share."""
-    # no interpolation, which would add an error of the order to be measured
+    # without interpolation, whose error would have the order to be measured
     return value[strides(fine, coarse)]
 
 
@@ -179,7 +179,7 @@ def richardson(values: list[np.ndarray], h: np.ndarray, mask: np.ndarray, tol: f
             "nothing: no Richardson estimate, since from grid to grid the mean "
             f"changes by {wide:.3g} and {narrow:.3g}, which shows no order"
         )
-    # imported here, because only a study without a reference needs it
+    # imported here, because it is only needed if there is no reference
     from scipy.optimize import brentq
 
     order = brentq(excess, FLATTEST, STEEPEST)

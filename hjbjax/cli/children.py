@@ -1,7 +1,7 @@
 """Child processes that end when their launcher ends, and a record of how each of them ended.
 
 The launcher handles one event at a time. Signals and ends of children go through one queue, so a signal cannot
-interrupt the launcher between the start of a child and the record of it:
+interrupt the launcher between starting a child and recording it:
 
     a signal (SIGINT, SIGTERM, SIGHUP)   ask every child to end; a second signal kills them
     a child dies                         ask the others to end
@@ -15,8 +15,8 @@ interrupt the launcher between the start of a child and the record of it:
 A request to end is SIGTERM, and also SIGCONT for a stopped child. A launcher that is killed cannot send it, but
 children started by ``followed`` notice this: their standard input is a pipe that closes with the launcher.
 
-This file imports only the standard library and also runs as the script of a child. A child therefore follows its
-launcher within milliseconds, although importing JAX takes seconds.
+This file imports only the standard library and also runs as the script of a child. A child therefore reacts to the end
+of its launcher after milliseconds, although importing JAX takes seconds.
 """
 
 import collections
@@ -43,7 +43,7 @@ LINES = 20  # number of last lines of standard output that are searched for a fa
 LINGER = 0.5  # seconds to wait for the last output of a child that has ended
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 REQUEST = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGCONT") if hasattr(signal, name))
-SHARED = (signal.SIGTERM, signal.SIGABRT)  # signals by which a child also ends because of another child
+SHARED = (signal.SIGTERM, signal.SIGABRT)  # signals that may end a child because another child ended
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +99,7 @@ class ChildEnds:
 
     @property
     def culprit(self) -> End | None:
-        """The child that brought the others down; None if all ended with exit code 0 and a farewell.
+        """The child whose end made the others fail; None if all ended with exit code 0 and a farewell.
 
         If a child is killed or stopped, the others fail as well, possibly before it ends.
         """
@@ -178,7 +178,7 @@ class _Launcher:
         self.stopped: tuple[int, ...] = ()
         self.late: tuple[int, ...] = ()
         self.killed: tuple[int, ...] = ()
-        self.quiet = threading.Event()  # if set, the first child's output only concerns the missing others
+        self.quiet = threading.Event()  # if set, output of the first child is only about missing children
         self.unwritten: list[OSError] = []
 
     def start(self, command: Command) -> None:
@@ -369,7 +369,8 @@ def _signals_into(events: "queue.SimpleQueue[Any]") -> Iterator[None]:
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
                 usual[number] = signal.signal(number, note)
         if hasattr(signal, "SIGCHLD") and signal.getsignal(signal.SIGCHLD) is signal.SIG_IGN:
-            # some parents leave it ignored, and then the system drops exit codes and every child seems to succeed
+            # some parents leave it ignored; the system would then drop exit codes, and every child would seem to
+            # succeed
             usual[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         yield
     finally:
@@ -391,7 +392,7 @@ def _is_stopped(process: subprocess.Popen) -> bool:
 
 
 def _follow(lifeline: int) -> None:
-    """End this process when the pipe closes: by SIGTERM, which saves its work, and for certain after ``GRACE``."""
+    """End this process when the pipe closes: by SIGTERM, so that it saves its work, and by force after ``GRACE``."""
     while os.read(lifeline, 1):
         pass
     os.kill(os.getpid(), signal.SIGTERM)
@@ -404,7 +405,7 @@ def _main(module: str) -> None:
     lifeline, nothing = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.close(nothing)
-    # the launcher sends SIGTERM; SIGINT may come from a signal to all processes by name, including the launcher
+    # the launcher sends SIGTERM; SIGINT may have been sent by name to all processes, including the launcher
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow, args=(lifeline,), daemon=True).start()
     runpy.run_module(module, run_name="__main__")

@@ -84,7 +84,7 @@ class OneLineGroup(click.Group):
 
 
 def _is_joined() -> bool:
-    """True in a process of a launch that has failed before it parted from the others; they would hold up its end."""
+    """True in a process of a launch that failed before it left the launch; a normal exit would wait for the others."""
     if "jax" not in sys.modules:
         return False
     try:
@@ -110,7 +110,7 @@ def _own_endings() -> Iterator[None]:
 
 
 def _for_a_parameter(error: click.ClickException) -> str | None:
-    """The message if a parameter of a problem was given as an option of the command; None for other errors."""
+    """The message if a parameter of a problem was passed as an option of the command; None for other errors."""
     if not isinstance(error, click.NoSuchOption):
         return None
     name = error.option_name.lstrip("-").replace("-", "_")
@@ -222,7 +222,7 @@ def finite(text: str, kind: type[N]) -> N | None:
 def unknown(what: str, got: str, allowed: Iterable[str]) -> str:
     """The message for an unknown name, with the allowed names and the closest one."""
     names = list(allowed)
-    # with hyphens first, for problem names in Python spelling, then as given, for parameters, which have underscores
+    # first with hyphens, for names of problems in Python spelling; then unchanged, because parameters have underscores
     near = difflib.get_close_matches(got.lower().replace("_", "-"), names, 1) or difflib.get_close_matches(
         got, names, 1
     )

@@ -16,7 +16,7 @@ CODE = 130  # 128 + SIGINT, the exit code by convention of shells
 
 
 def end(number: int, frame: FrameType | None) -> None:
-    """End the process at once, without flushing its streams, which hold nothing of interest then."""
+    """End the process at once, without flushing its streams, which do not hold anything of interest at that time."""
     with contextlib.suppress(OSError):  # not through Python's stream, which the signal may have interrupted
         os.write(2, b"\n" * os.isatty(2) + b"hjbjax: interrupted\n")  # the newline ends the line with ^C on a terminal
     os._exit(CODE)

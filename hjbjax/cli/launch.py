@@ -140,7 +140,7 @@ def mesh_of(counts: tuple[int, ...] | None) -> "Mesh | None":
 
 
 def arrive() -> None:
-    """Report the start of this process to its launcher, if there is one; otherwise JAX blames the one that waits."""
+    """Report the start of this process to its launcher, if any; otherwise JAX would blame a process that waits."""
     if member() is not None:
         _report(ARRIVED)
 
@@ -256,7 +256,7 @@ def _verdict(outcome: children.ChildEnds, way_on: str) -> int:
     """The exit code of a launch.
 
     Raises:
-      Failure: the process that brought the others down, and how to continue.
+      Failure: names the process that made the others fail, and says how to continue.
     """
     processes, first, culprit = len(outcome.ends), outcome.end_of(0), outcome.culprit
     if first.code in SOLVED or culprit is None:

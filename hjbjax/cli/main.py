@@ -120,7 +120,7 @@ def solve(
         processes_of.leave()
         return
     out = Path(name) if out is None else out
-    if processes_of.rank() == 0:  # before the processes meet: one that fails afterwards waits for the others to part
+    if processes_of.rank() == 0:  # before the processes meet: a later failure would wait for the others
         _check_places(out, force, options["checkpoint"], options["resume"])
     options["mesh"] = processes_of.mesh_of(devices)
     check_jax()
@@ -173,7 +173,7 @@ def _raise_unless_converged(solution: "Solution") -> None:
 def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
     """Run a command in processes that split its nodes, as in "hjbjax launch --processes 2 -- solve pendulum"."""
     processes_of.check_launch(words, processes, heartbeat)
-    # a process takes ten seconds to start, so check here what each of them would refuse
+    # a process takes ten seconds to start, so refuse here what every process would refuse
     given = solve.make_context("solve", list(words[1:]), parent=click.get_current_context().parent).params
     from hjbjax.cli import run_folder
 
@@ -261,7 +261,7 @@ def _build(entry: "Entry", parameters: dict[str, Any], shape: tuple[int, ...] | 
 def _one_line_warnings() -> Iterator[None]:
     """Show warnings as one line each, without the source line that Python adds.
 
-    JAX repeats a fault of its cache for every program. Only the first of them is shown.
+    JAX repeats a warning about its cache for every program. Only the first one is shown.
     """
     from hjbjax.solvers import compile_cache
 
@@ -369,7 +369,7 @@ def _write(
             run_folder.publish(staging, out, made, force)
             published = bool(made)
     except OSError as error:
-        # the hidden folder is gone by the time that anybody reads this
+        # the hidden folder no longer exists when the user reads this
         reason = str(error).replace(f"{staging}{os.sep}", f"{out}{os.sep}")
         if published:
             raise Failure(f"{reason}; written: {', '.join(text_of(out / file) for file in made)}", 5) from error

@@ -46,14 +46,14 @@ FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # the types of JSON
 SAMPLES = 400  # samples of a bang-bang feedback along its trajectory
 DPI = 160
-NAME = 40  # number of characters of a folder's name that a folder next to it repeats
+NAME = 40  # characters of a folder's name that are repeated in the name of a new folder next to it
 
 
 def check_folder(out: Path, force: bool = False) -> None:
     """Raise if a folder contains results, unless ``force``, or if the path is not a folder.
 
     Raises:
-      OSError: with advice in one line.
+      OSError: the folder must not be used; the message has one line with advice.
     """
     placement.current_folder()  # otherwise JAX raises FileNotFoundError when it filters a traceback
     # lexists also finds a broken link, through which files would be written
@@ -126,7 +126,7 @@ def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -
     out.mkdir(parents=True, exist_ok=True)
     check_folder(out, force)  # check again, because the solve may have taken long
     for file in FILES:
-        if file in made:  # the first file is always made, so of two concurrent commands one fails before it moves any
+        if file in made:  # of two concurrent commands one fails at the first file
             placement.place(folder / file, out / file, force)
         else:
             (out / file).unlink(missing_ok=True)
@@ -175,7 +175,7 @@ def make(
     """Write the files one by one; yield the name of each file, and the trajectory with the last one.
 
     An interrupted solve is saved but not plotted, and a solve that has not converged has no trajectory. ``finish`` is
-    the problem and the feedback of the final phase, if the target prescribes the cost of this phase.
+    the problem and the feedback of the final phase inside the target, if the exit cost is the cost of that phase.
 
     Raises:
       OSError: a file cannot be written.
@@ -187,7 +187,7 @@ def make(
         return
     fixed = dict(enumerate(start[2:], 2))  # cut all axes from the third on at the start of the trajectory
     jumps = is_bang_bang(problem, solution)
-    # figures of our own, because pyplot is slow to import and would keep them
+    # figures without pyplot, which is slow to import and would keep them
     value = plotting.value(solution, ax=axes(), fixed=fixed, target=problem.target)
     with_curve(value, solution, fixed, jumps).save(folder / "value.png", dpi=DPI)
     yield "value.png", None

@@ -4,10 +4,10 @@ The diagonal jumps of the chain take Σ_j |a_ij| h_i/h_j from a_ii, and the rema
 
     a_ii/h_i ≥ Σ_{j≠i} |a_ij|/h_j        (a = σσᵀ, scaled diagonal dominance)
 
-Let M_ij = |a_ij|/a_ii. The densities ρ = 1/h must satisfy ρ ≥ Mρ. They exist exactly if the spectral radius of M is at
-most one. If it is less, ρ = (I − M)⁻¹ s for some s > 0; if it is one, ρ is the Perron vector of M, block by block. In
-2-D they always exist for a single matrix a: h₁/h₂ = √(a₁₁/a₂₂). For several matrices, as for state-dependent noise,
-ρ ≥ Mρ with the largest entries of all M is sufficient, and in 2-D also necessary.
+Let M_ij = |a_ij|/a_ii. The densities ρ = 1/h must satisfy ρ ≥ Mρ. Such densities exist if and only if the spectral
+radius of M is at most one. If it is less, ρ = (I − M)⁻¹ s for some s > 0; if it is one, ρ is the Perron vector of M,
+block by block. In 2-D they always exist for a single matrix a: h₁/h₂ = √(a₁₁/a₂₂). For several matrices, as for
+state-dependent noise, ρ ≥ Mρ with the largest entries of all M is sufficient, and in 2-D also necessary.
 """
 
 import dataclasses
@@ -87,7 +87,7 @@ def shape(m: np.ndarray, grid: Grid, wanted: np.ndarray) -> tuple[int, ...] | No
     """
     lengths = np.asarray(grid.hi) - np.asarray(grid.lo)
     ends = 1 - np.array(grid.periodic, dtype=int)
-    # counts are integers, which few factors match well: try sizes closest to the present first, from half to twice
+    # counts are integers, so few factors match well: try sizes from half to twice the present size, the closest first
     for factor in sorted(np.geomspace(0.5, 2.0, 2001), key=lambda factor: abs(np.log(factor))):
         intervals = np.maximum(np.round(lengths / wanted * factor), 1)
         density = intervals / lengths

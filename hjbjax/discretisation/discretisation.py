@@ -34,7 +34,7 @@ class Scheme(abc.ABC):
 
     @property
     def monotone(self) -> bool:
-        """True if the scheme is a Markov chain (``Chain``); only then its solutions are certified."""
+        """True if the scheme is a Markov chain (``Chain``). Only these schemes give certified solutions."""
         return False
 
     @property
@@ -44,7 +44,7 @@ class Scheme(abc.ABC):
 
     @property
     def paths(self) -> Paths | None:
-        """The paths that ``solve`` follows; None, the default, if the scheme has slopes."""
+        """The paths that ``solve`` follows instead of using slopes; None by default."""
         return None
 
     @property
@@ -69,12 +69,12 @@ class Scheme(abc.ABC):
 
     @property
     def points(self) -> int:
-        """The least number of nodes per axis."""
+        """The smallest number of nodes per axis."""
         return 2
 
     @property
     def blends(self) -> bool:
-        """True if ``slopes`` returns the one-sided differences where ``Differences.first_order`` is true."""
+        """True if ``slopes`` returns the one-sided differences whenever ``Differences.first_order`` is true."""
         return False
 
     @property
@@ -85,20 +85,20 @@ class Scheme(abc.ABC):
     @property
     @abc.abstractmethod
     def chain(self) -> "Chain":
-        """The monotone chain of the scheme, such as ``Upwind()``: gives start, corrections and explicit step limits."""
+        """A monotone chain, such as ``Upwind()``, for the start, the corrections and the limit of explicit steps."""
 
     @abc.abstractmethod
     def slopes(self, around: "Differences") -> Sequence[tuple[jax.Array, jax.Array]]:
-        """The slopes P⁺ and P⁻ along every axis, each (*grid): drift f has the gain f⁺ P⁺ + f⁻ P⁻; zero at a wall."""
+        """P⁺ and P⁻ along every axis, each (*grid), zero at a wall. Drift f gives max(f, 0) P⁺ + min(f, 0) P⁻."""
 
 
 class Chain(Scheme):
-    """The base class of monotone schemes, which are Markov chains: along an axis drift f and diffusion a give
+    """The base class of monotone schemes, which are Markov chains. Drift f and diffusion a along an axis contribute
 
         [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻),    e ≥ max(a, h⁺ f, −h⁻ f),
 
-    with distances h⁺ and h⁻ to the two neighbours; e(f) increases by at most h|f|. A chain defines ``excess`` and
-    ``kinks``. ``schemes`` explains the treatment of walls, and shows an example.
+    where h⁺ and h⁻ are the distances to the two neighbours. e(f) may exceed e(0) by at most h|f|. A chain defines
+    ``excess`` and ``kinks``. ``schemes`` explains the treatment of walls and shows an example.
     """
 
     monotone, stages = True, 1
@@ -192,7 +192,7 @@ class Discretisation:
     @property
     def level(self) -> jax.Array:
         """l at every node, (*grid), with an exact zero where it is zero up to rounding; ≤ 0 in the target."""
-        # a target may return integers
+        # the function of a target may return integers
         return cut_cells.level(jnp.asarray(self.at_nodes(self.problem.target), self.dtype), self.grid)
 
     @property
@@ -227,7 +227,7 @@ class Discretisation:
 
     @property
     def apart(self) -> bool:
-        """True if each player's drift is upwinded separately: the scheme has ``split``, and they share a component.
+        """True if each player's drift is upwinded separately: the scheme has ``split``, and both drive some component.
 
         Drift and cost must then be sums over the players, f = f(x, u, 0) + [f(x, 0, d) − f(x, 0, 0)]. At constrained
         ends the admissible actions depend on the sum.
@@ -238,7 +238,7 @@ class Discretisation:
         return found.separable and found.meet
 
     def drifts(self, u: list, d: list | None = None, x: list | None = None) -> list[list]:
-        """The drift in the parts that are upwinded separately: the whole drift, or one part per player.
+        """The parts of the drift that are upwinded separately: the whole drift, or one part per player.
 
         The noise goes with the first part. Components that the disturbance does not drive are exactly zero in the
         second part.
@@ -247,11 +247,11 @@ class Discretisation:
             return [self.drift(u, d, x)]
         found = dependence.influence(self.problem, self.grid.ndim, self.dtype)
         driven, zero = found.drift.driven_by(found.disturbance), jnp.zeros((), self.dtype)
-        # at zero, even if it is not admissible: any point splits a sum of two functions
+        # at zero, admissible or not, because any point splits a sum of two functions
         no_u, no_d = ([zero] * len(inputs) for inputs in (found.control, found.disturbance))
         still, pushed = self.drift(no_u, no_d, x), self.drift(no_u, d, x)
-        # an exact zero where the disturbance does not act, because upwinding depends on the sign of pushed − still =
-        # 1e-17
+        # exactly zero where the disturbance does not act: the sign of a rounding error, pushed − still = 1e-17, would
+        # choose the upwind side
         theirs = [pushed[i] - still[i] if i in driven else zero for i in range(self.grid.ndim)]
         return [self.drift(u, no_d, x), theirs]
 
@@ -262,7 +262,7 @@ class Discretisation:
         return components.scalar(self.problem.cost, *self._arguments(u, d, x), dtype=self.dtype)
 
     def diffusion(self, u: list, d: list | None = None, x: list | None = None) -> dict[tuple[int, int], Any]:
-        """The entries a_ij, i ≤ j, of a = σσᵀ, without those that are zero by construction."""
+        """The entries a_ij, i ≤ j, of a = σσᵀ, except entries that are zero by construction."""
         noise, n = self.problem.noise, self.grid.ndim
         if noise is None:  # an empty dict instead of zeros, which would cost a pass over the nodes
             return {}
@@ -279,7 +279,7 @@ class Discretisation:
 
     @property
     def decay(self) -> Any:
-        """β in β V: the discount, a number, plus the killing at the nodes, (*grid), if there is any."""
+        """The factor of V in the equation: the constant discount plus any killing, which is at the nodes, (*grid)."""
         killing = self.problem.killing
         return self.problem.discount if killing is None else self.problem.discount + self.at_nodes(killing)
 
@@ -304,7 +304,7 @@ class Discretisation:
 
     def central_nodes(self, x: list, links: Sequence[Links]) -> list[Any]:
         """For every axis the nodes where central differences are monotone under all representative actions, bool."""
-        # whether H is central must not depend on the action, otherwise its kinks would move with it
+        # must not depend on the action, otherwise the kinks of H would move with the action
         found: list[Any] = [True] * self.grid.ndim
         for u, d in self._probes():
             f, a = self.drift(u, d, x), self.diffusion(u, d, x)
@@ -329,7 +329,7 @@ class Discretisation:
 
 @dataclasses.dataclass(frozen=True)
 class Differences:
-    """Input of ``Scheme.slopes``: V at the nodes, its differences between nodes, and where noise acts.
+    """The input of ``Scheme.slopes``: V at the nodes, its differences between nodes, and the nodes where noise acts.
 
     Attributes:
       on: the problem on its grid.
@@ -338,7 +338,7 @@ class Differences:
       links: the distances to the neighbours along every axis.
       one_sided: D⁺ and D⁻ along every axis, each (*grid); zero across a wall.
       unreachable: the nodes whose stored value is far above all others, bool (*grid); None if there are none.
-      first_order: true where the slopes are the one-sided differences, a truth value that may be traced; None: nowhere.
+      first_order: true if the slopes must be the one-sided differences; a bool that may be traced, or None for false.
         Only schemes with ``blends`` read it, which saves an array per slope.
     """
 

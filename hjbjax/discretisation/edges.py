@@ -86,7 +86,7 @@ def barred(f: PerNode, grid: Grid, axis: int, rounding: Rounding, coarser: Numbe
 
 
 def beside(lost: jax.Array, grid: Grid) -> tuple[tuple[jax.Array, jax.Array], ...]:
-    """For every axis, the nodes whose upper neighbour, and those whose lower neighbour, is ``lost``, bool (*grid)."""
+    """Per axis, the nodes whose upper neighbour is ``lost`` and the nodes whose lower one is, bool (*grid) each."""
     up, down = ([stencil.unit(grid, axis, step) for axis in range(grid.ndim)] for step in (1, -1))
     pairs = zip(up, down, strict=True)
     return tuple((stencil.neighbour(lost, grid, p), stencil.neighbour(lost, grid, q)) for p, q in pairs)

@@ -1,4 +1,4 @@
-"""The base class of schemes' paths: which arcs to try from every node, and for which problems."""
+"""The base class of the paths that a scheme follows: it plans the arcs from every node, and checks the problem."""
 
 import abc
 
@@ -22,7 +22,7 @@ class Plan:
 
     @property
     def count(self) -> int:
-        """K = A R: the arcs of the first action, by increasing length, then those of the next."""
+        """K = A R. Arcs are numbered action by action, and by increasing length for each action."""
         return len(self.actions) * len(self.legs)
 
 
@@ -31,10 +31,10 @@ class Paths(abc.ABC):
 
     @abc.abstractmethod
     def check(self, problem: Problem, grid: Grid) -> None:
-        """Refuse a problem, or a grid, without such paths.
+        """Refuse a problem or a grid that these paths do not support.
 
         Raises:
-          ValueError: names an alternative.
+          ValueError: not supported; the message names an alternative.
         """
 
     @abc.abstractmethod

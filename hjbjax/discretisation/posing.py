@@ -1,7 +1,7 @@
-"""Ingredients that the solvers do not know, for public functions: bounds and discounts that are functions of the state.
+"""Decorators of public functions, for problems whose bounds or discount are functions of the state.
 
-A decorated function receives problems with fixed sets and with discounts that are numbers. Its solutions get the
-controls and the problem of the user.
+The solvers support fixed sets of controls and constant discounts. A decorated function receives such a problem instead
+of the user's. In the solutions that it returns, the controls and the problem are the user's again.
 """
 
 import inspect
@@ -34,7 +34,7 @@ T = TypeVar("T")
 def without_horizon(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function of (problem or problems, grid, ...) without a horizon.
 
-    Problems with a fixed set of controls, or none, and a discount that is a number pass through unchanged.
+    Problems with a constant discount, and with a fixed set of controls or no control, pass through unchanged.
     """
     return _posing(function, _in_own_time)
 
@@ -45,7 +45,7 @@ def with_horizon(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str], Problem]) -> Callable[P, T]:
-    """A public function that receives problems that the solvers know."""
+    """Decorate a public function; ``discounting`` makes the discount of each problem constant."""
     first, second = list(inspect.signature(function).parameters)[:2]
 
     def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
@@ -74,7 +74,7 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
 
 
 def _depends_on_state(problem: object) -> bool:
-    """True for a problem whose bounds or whose discount are functions of the state."""
+    """True for a problem whose bounds or discount are functions of the state."""
     return isinstance(problem, Problem) and (callable(problem.discount) or callable(problem.controls))
 
 
@@ -91,7 +91,7 @@ def _of_user(found: Any, problem: Problem) -> Any:
 
 
 def _restored(solution: Solution, problems: list[Problem], lane: int | None) -> Solution:
-    """A partial solution with the controls and the problem of the user; unchanged if its problem is not known."""
+    """A partial solution with the user's controls and problem; unchanged if it may belong to several problems."""
     if lane is None and len(problems) > 1:
         return solution
     return _of_user(solution, problems[lane or 0])
@@ -101,14 +101,14 @@ def _restored(solution: Solution, problems: list[Problem], lane: int | None) -> 
 
 
 def _with_fixed_set(problem: Problem, grid: Grid, name: str) -> Problem:
-    """The problem with costs and a fixed set of controls, after a check of its functions and of its bounds."""
+    """Check the functions and the bounds of a problem, and return it with costs and with a fixed set of controls."""
     problem = costs_of(problem)
     checks.of_one_state(with_any_control(problem, grid.ndim), grid.ndim, "the number of axes of the grid")
     if not callable(problem.controls):
         return problem
     fixed = in_unit_box(problem, grid.ndim)
     bounds = _bounds(problem, grid, None)
-    if not is_traced(bounds):  # otherwise the functions are NaN there, which the host refuses
+    if not is_traced(bounds):  # if traced, the functions are NaN there, which a check on the host refuses later
         faulty = np.any(~np.isfinite(bounds[0]) | ~np.isfinite(bounds[1]), axis=-1)
         if faulty.any():
             index = tuple(int(i) for i in np.argwhere(faulty)[0])
@@ -134,7 +134,7 @@ def _bounds(problem: Problem, grid: Grid, times: Any) -> tuple[Array, Array]:
 
 
 def _at_all(controls: Callable, nodes: Array, moments: Any) -> tuple[Array, Array]:
-    """The bounds at nodes (*grid, n), at one or several times if there are any."""
+    """The bounds at the nodes, (*grid, n), and at ``moments``: None, one time or several."""
     flat = jnp.reshape(nodes, (-1, nodes.shape[-1]))
 
     def at_nodes(*t: Any) -> tuple[Array, Array]:
@@ -153,7 +153,7 @@ _at_all_jit = jax.jit(_at_all)
 
 
 def _in_own_time(problem: Problem, grid: Grid, name: str) -> Problem:
-    """The problem in its own time, after a check of β at the nodes."""
+    """Check β at the nodes, and return the problem in the time τ with dτ = β(x) dt."""
     if not callable(problem.discount) or problem.time_dependent:  # a function of time is refused
         return problem
     _check_rate(problem, grid, name)
@@ -161,7 +161,7 @@ def _in_own_time(problem: Problem, grid: Grid, name: str) -> Problem:
 
 
 def _with_killing(problem: Problem, grid: Grid, name: str) -> Problem:
-    """The problem of a march, which checks its functions at the nodes."""
+    """The problem of a march, with β(x) as the killing; the march itself checks its functions at the nodes."""
     return with_killing(problem)
 
 

@@ -4,11 +4,10 @@ On axis i with spacing h (h⁺ up, h⁻ down), drift f_i and diffusion a = σσ�
 
     c_i^+ = (e_i + h⁻ f_i) / (h⁺ (h⁺ + h⁻)),     c_i^- = (e_i − h⁺ f_i) / (h⁻ (h⁺ + h⁻))
 
-with e_i = a_ii + h⁺ f_i⁺ + h⁻ f_i⁻ for the plain upwind chain, which gives c_i^± = f_i^±/h + a_ii/(2h²) on a uniform
-grid. With central differences wherever they are monotone, e_i = max(a_ii, h⁺ f_i, −h⁻ f_i). Correlated noise jumps
-along
-diagonals: a pair i, j gives c^{±(e_i + e_j)} = a_ij⁺/(2 h_i h_j), c^{±(e_i − e_j)} = a_ij⁻/(2 h_i h_j), and takes
-|a_ij| h_i/h_j from a_ii.
+where e_i = a_ii + h⁺ f_i⁺ + h⁻ f_i⁻ for the plain upwind chain, with f⁺ = max(f, 0) and f⁻ = max(−f, 0). This gives
+c_i^± = f_i^±/h + a_ii/(2h²) on a uniform grid. With central differences wherever they are monotone, e_i = max(a_ii,
+h⁺ f_i, −h⁻ f_i). Correlated noise causes diagonal jumps: a pair i, j gives c^{±(e_i + e_j)} = a_ij⁺/(2 h_i h_j) and
+c^{±(e_i − e_j)} = a_ij⁻/(2 h_i h_j), and reduces a_ii by |a_ij| h_i/h_j.
 
 With Q = Σ c and Δt = 1/max_u Q, the transition probabilities are c Δt, and the self-transition is 1 − Q Δt (the chapter
 prints (13.3) without the "1 −"). At a wall, outward drift is cut off and noise reflects on the node: the chain moves
@@ -166,7 +165,7 @@ def _reflecting(grid: Grid, axis: int, step: int) -> Array:
 
 
 def _add_diagonal_jumps(table: dict[Offset, Any], entry: Any, grid: Grid, i: int, j: int) -> None:
-    """Add the diagonal jumps of a pair of axes; those that leave the box go to the mirror image (noise reflects)."""
+    """Add the diagonal jumps of a pair of axes; a jump out of the box goes to the mirror image (noise reflects)."""
     scale = 2 * grid.spacing(i) * grid.spacing(j)
     pairs = list(itertools.product((1, -1), repeat=2))
     # a_ij⁺ along the diagonal, a_ij⁻ across it

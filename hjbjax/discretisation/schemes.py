@@ -50,23 +50,23 @@ and the kinks of the gain of a drift component; its solutions are certified. The
     ('CONVERGED', 0.17)
 
 The exact value is (√5 − 1)/8 = 0.155; the difference is due to the large diffusion. The diffusion must satisfy
-e ≥ max(a, h⁺f, −h⁻f), here a ``speed`` of at least |f|, because probabilities cannot be negative. With less, the chain
-would represent only part of the drift, and the solve is refused. The class must be hashable, since compiled programs
-are cached by it. Its methods are traced, so they must not branch on numbers. Under ``jit``, ``vmap`` and ``grad`` a
-solve requires a monotone scheme, and does not check values.
+e ≥ max(a, h⁺f, −h⁻f), here a ``speed`` of at least |f|, because probabilities cannot be negative. With a smaller e the
+chain would represent only part of the drift, and the solve is refused. The class must be hashable, since compiled
+programs are cached by it. Its methods are traced, so they must not branch on numbers. Under ``jit``, ``vmap`` and
+``grad`` a solve requires a monotone scheme, and does not check values.
 
 For a scheme that follows paths over many cells instead of using slopes, see ``hjbjax.semi_lagrangian``.
 
-All schemes treat walls in the same way. A wall is on a node, whose cell is half a cell. With noise a, outward drift n
-(f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
+All schemes treat walls in the same way. A wall passes through a node, so the cell of that node is half as wide. With
+noise a, outward drift n (f at an upper end, −f at a lower one) and ∂V/∂n = 0 on the wall, the balance over that cell is
 
     (h/2)(βV − L) = −(a/2h − n/2)(V_N − V_{N−1}),      so the chain moves inwards at the rate (a − h n)/h²:
 
-the mirrored neighbour V_{N+1} = V_{N−1} gives a/h² (V_{N−1} − V_N), and the drift acts on the inner difference. For V
-the drift at the wall matters little: an error O(h) at one node is O(h²). For the law of the chain, outward drift must
-hold noise back as inward drift helps it: then p_N/p_{N−1} = (a + h n)/(a − h n), as between two interior nodes. A chain
-uses (e(n⁺) − h n)/h², with e for the outward part of the drift. This is never negative, and without noise it is |n|/h
-for n < 0 and zero for n > 0, where the drift is cut off.
+the mirrored neighbour V_{N+1} = V_{N−1} gives a/h² (V_{N−1} − V_N), and the drift acts on the inner difference. The
+drift at the wall hardly affects V: an error O(h) at this one node changes V by O(h²). It does affect the law of the
+chain: outward drift must reduce the rate by as much as inward drift raises it. Then p_N/p_{N−1} = (a + h n)/(a − h n),
+as between two interior nodes. A chain uses (e(n⁺) − h n)/h², with e for the outward part of the drift. This rate is
+never negative. Without noise it is |n|/h for n < 0 and zero for n > 0, where the drift is cut off.
 """
 
 import functools
@@ -116,7 +116,7 @@ def falls_short(scheme: Chain, f: Any, a: Any, link: Links) -> Any:
 def kinks(
     scheme: Chain, a: Any, slopes: tuple[Any, Any], link: Links, grid: Grid, axis: int
 ) -> tuple[Sequence[Any], Sequence[Any]]:
-    """The drifts at which the derivative of the gain of ``weights`` jumps, and its derivatives, one more."""
+    """The drifts at which the derivative of the gain of ``weights`` jumps, and its derivatives between them."""
     found, derivatives = scheme.kinks(a, slopes, link)
     if not stencil.has_walls(grid, axis):
         return found, derivatives

@@ -1,10 +1,11 @@
 """Neighbours and one-sided differences on a grid, with ghost cells.
 
-An edge that is neither periodic nor open is a wall on its node. For drift, the value beyond is a copy of the node, so
-the one-sided difference is zero and outward drift is projected onto the box. For noise it is the mirror image,
-V_{N+1} = V_{N−1}: a reflected path has ∂V/∂n = 0 there, which an even extension satisfies to second order, while the
-copy would move the wall outwards by half a spacing. Beyond an open end the value is extrapolated by the parabola
-through the last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} for equal spacings.
+An end is a wall through its last node, unless V continues beyond it: at open, linear, Neumann and Robin ends. For
+drift, the value beyond is a copy of the node, so the one-sided difference is zero and outward drift is projected onto
+the box. For noise it is the mirror image, V_{N+1} = V_{N−1}: a reflected path has ∂V/∂n = 0 there, which an even
+extension satisfies to second order, while the copy would move the wall outwards by half a spacing. Beyond an open end
+the value is extrapolated by the parabola through the last three nodes, V_{N+1} = 3V_N − 3V_{N−1} + V_{N−2} for equal
+spacings. ``continuation`` has the weights for all these ends.
 
 If the nodes are divided among several devices, the values beyond the last node of a part are fetched from the adjacent
 part: see ``problem.layouts``.
@@ -184,7 +185,7 @@ def beyond(values: AtNodes, grid: Grid, axis: int, step: int, ended: jax.Array) 
     cyclic, layout = bool(grid.periodic[axis]), grid.layout
     if not (cyclic or layout.is_divided(axis)):
         return ended
-    # the slices of the other side at the end that faces this one
+    # the slices at the opposite end of the adjacent part
     given = slices(values, grid, axis, -step, count=ended.shape[axis])
     found = layout.fetched(given, axis, step, cyclic=cyclic)
     return found if cyclic else jnp.where(layout.at_end(axis, step), ended, found)
@@ -219,7 +220,7 @@ def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bo
             parts = [outside, jax.lax.slice_in_dim(values, 0, grid.shape[axis] - 1, axis=axis)]
         else:
             parts = [jax.lax.slice_in_dim(values, 1, grid.shape[axis], axis=axis), outside]
-        moved = jnp.concatenate(parts, axis=axis)  # fused, while a pad would fill an array
+        moved = jnp.concatenate(parts, axis=axis)  # XLA fuses this, but stores an array for a pad
         if step > 0 and not grid.layout.even(axis):
             # the last entry may be padding of this part, and the one before it the last node
             place = jnp.arange(grid.shape[axis]).reshape([-1 if i == axis else 1 for i in range(grid.ndim)])

@@ -56,7 +56,7 @@ def check_guess(guess: object, n: int, horizon: object) -> None:
             f"pontryagin: got a guess on a grid of {guess.grid.ndim} axes, wanted {n}, the length of x0; "
             "pass the Solution of this problem, or no guess"
         )
-    # the guess is its closed loop, simulated for an unknown time, but its feedback ends at the last time
+    # the guess is the closed loop of the solution over an unknown time, but a marched feedback ends at its last time
     if guess.times is not None and horizon is None:
         raise ValueError(
             "pontryagin: got a time-dependent Solution as the guess and no horizon, but its feedback ends at "

@@ -4,8 +4,8 @@ SciPy's tolerances are absolute: a length of 1e-9 is below every tolerance, and 
 near one keep their unit. Other sizes are measured along the guess and rounded to powers of two, which are exact.
 
 A cost such as θ² on [−π, π) is continuous at the seam of the axis, and so are the costate and H, but ṗ jumps. A
-collocation across the seam refines its mesh there without end. The remedy is one arc per turn, in the coordinates of
-the box, with unknown crossing times and the condition x_i = end of the axis. Every arc is then smooth.
+collocation across the seam would refine its mesh there indefinitely. The remedy is one arc per turn, in the coordinates
+of the box, with unknown crossing times and the condition x_i = end of the axis. Every arc is then smooth.
 """
 
 import dataclasses

@@ -163,7 +163,7 @@ def pontryagin(
 
 
 def _guess_in_costs(guess: Solution | Extremal | None) -> Solution | Extremal | None:
-    """The guess with the value or the costates of costs."""
+    """The guess with its value or its costates as costs."""
     return in_costs(guess) if isinstance(guess, Solution) else guess and with_payoff(guess, COST)
 
 

@@ -4,10 +4,10 @@ The guess from a solution on a grid is its closed loop, with the interpolated DV
 point is the closed loop under the Riccati costate, whose control is clipped to the admissible set. Otherwise the guess
 is a line between the ends, a line to the boundary of the target, or a path under the best constant control.
 
-A zero costate is a bad guess. If effort has a cost, u is zero under it and nothing moves. The equations then do not
-depend on the final time, so their Jacobian is singular. On the boundary of a target p = ψ_x + ν l_x, and the condition
-H = βψ − ψ_t − ν l_t has at most two roots ν, because H is a minimum of functions that are affine in p and therefore
-concave in ν. The first positive root gives the costate of a path that arrives from outside.
+A zero costate is a bad guess. If effort has a cost, a zero costate gives u = 0 and nothing moves. The equations then do
+not depend on the final time, so their Jacobian is singular. On the boundary of a target p = ψ_x + ν l_x, and the
+condition H = βψ − ψ_t − ν l_t has at most two roots ν, because H is a minimum of functions that are affine in p and
+therefore concave in ν. The first positive root gives the costate of a path that arrives from outside.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ COLUMNS = 101  # of a guess; the solver adds nodes where necessary
 SAMPLES = 400  # number of intervals in which a simulated guess keeps its control constant, because a feedback may jump
 FAR = 1e3  # times 1 + |x₀|: a simulation that gets there has diverged
 NEWTON = 50  # steps to the boundary of a target; a distance takes one, a squared distance about ten
-POWERS = np.arange(-80.0, 81.0)  # exponents of two for ν, which has the units of cost over those of l
+POWERS = np.arange(-80.0, 81.0)  # exponents of two for ν, whose units are the units of cost divided by the units of l
 FINER = np.linspace(0.0, 1.0, 65)  # between two powers, for two digits
 BUDGET = 16  # number of constant controls to try
 

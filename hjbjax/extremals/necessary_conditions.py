@@ -102,7 +102,7 @@ class Extremal:
 
 
 def with_payoff(extremal: Extremal, payoff: str) -> Extremal:
-    """The extremal with costates, values and H of costs or of rewards; the solver's are those of costs."""
+    """A solver's extremal, which is about costs, with the costates, values and H of ``payoff``: costs or rewards."""
     if extremal.payoff == payoff:
         return extremal
     check = extremal.optimality_check
@@ -173,7 +173,7 @@ def assemble_extremal(
         parts.append({**part, "t": t, "z": np.concatenate([states, z[bvp.n :].T], 1)})
 
     def join(name: str, last: bool = True) -> np.ndarray:
-        """Join a quantity over all arcs, with the next arc's entry at a switch; without ``last``, one per interval."""
+        """Join a quantity over all arcs; a switch gets the next arc's entry. Without ``last``: one per interval."""
         rows = [part[name][:-1] for part in parts]
         return np.concatenate([*rows, parts[-1][name][-1:]] if last else rows)
 

@@ -2,9 +2,10 @@
 
 Let A = ∂(ẋ, ṗ)/∂(x, p) along a path with a continuous control. The neighbouring extremals that meet the end conditions
 are the frames (X, P)' = A (X, P), integrated backward from the end. Where X becomes singular they cross, and the path
-is not a minimum from earlier times on: this is a conjugate point (Jacobi). W = P X⁻¹ is the D²V of the neighbours. A
-backward step (a, b; c, d) of the midpoint rule is symplectic and maps W to (c + dW)(a + bW)⁻¹. It passes one conjugate
-point per negative eigenvalue of I + a⁻¹bW, where a⁻¹b is B H_uu⁻¹ B' times the step and semidefinite.
+is not a minimum from earlier times on: this is a conjugate point (Jacobi). W = P X⁻¹ is the Hessian
+D²V that the neighbouring extremals define. A backward step (a, b; c, d) of the midpoint rule is symplectic and maps W
+to (c + dW)(a + bW)⁻¹. It passes one conjugate point per negative eigenvalue of I + a⁻¹bW, where a⁻¹b is B H_uu⁻¹ B'
+times the step and semidefinite.
 
 With a free final time, the cost J(T) of the extremals with prescribed T is stationary. Its second derivative is the
 slope of the free-time condition along them, from the linearised equations. If it is negative, T is a maximum of J.

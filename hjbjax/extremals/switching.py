@@ -162,7 +162,7 @@ def _arcs(
         [np.interp(begin + s * length, blurred.times, row) for row in blurred.y]
         for begin, length in zip(starts, lengths, strict=True)
     ]
-    # keep only ν of the mixture; its durations are replaced by those of the arcs
+    # keep only ν of the mixture; its durations are replaced by the durations of the arcs
     nu = blurred.theta[len(blurred.theta) - (bvp.closing is Closing.TARGET) :]
     theta = np.concatenate([lengths if bvp.timed else [], nu])
     found = attempt(bvp, s, np.concatenate(pieces), theta, limits.rough)

@@ -109,7 +109,7 @@ def _integrated(given: tuple[InitialValueProblem, Stepping], reverse: bool) -> t
 
 
 def blank_record(loop: Loop, x0: np.ndarray, times: np.ndarray) -> tuple[tuple, tuple]:
-    """The state before the first interval, without its code, and empty rows for all intervals; NumPy arrays."""
+    """The state before the first interval, except its code, and blank rows for all intervals; NumPy arrays."""
     count, players = len(times) - 1, (loop.problem.controls, loop.problem.disturbances)
     inputs = [0 if admissible is None else admissible.dim for admissible in players]
     controls, disturbances = (np.zeros((count, size), x0.dtype) for size in inputs)

@@ -1,7 +1,7 @@
-"""Loops whose discount is a function of the state: ∫ β dt along the path is one more state.
+"""Simulation with a discount that is a function of the state: ∫ β dt along the path is one more state.
 
-With z = ∫ β(x(s)) ds the payments of the loop are e^{−z} times the payments of the problem, and nothing else is
-discounted. The integrator therefore only knows discounts that are numbers.
+Let z = ∫ β(x(s)) ds. The loop with the state (x, z) has no discount, and its payments are e^{−z} times the payments of
+the problem. The integrator therefore only needs to support constant discounts.
 """
 
 import dataclasses
@@ -25,13 +25,13 @@ PAYMENTS = ("cost", "exit_cost", "terminal_cost", "stopping_cost")
 
 @pytree_dataclass(static=("name",))
 class Weighted:
-    """A function of a problem as a function of the state (x, z)."""
+    """A function of a problem as a function of the state (x, z); payments are multiplied by e^{−z}."""
 
     problem: Problem
     name: str
 
     def __call__(self, *arguments: Any) -> Array:
-        """The value at the problem's arguments, with (x, z) in the place of x."""
+        """The value at the problem's arguments, with (x, z) instead of x."""
         problem, place = self.problem, int(self.problem.time_dependent)
         x, z = arguments[place][:-1], arguments[place][-1]
         own = (*arguments[:place], x, *arguments[place + 1 :])
@@ -48,7 +48,7 @@ class Weighted:
 
 
 def with_integral(loop: Loop, x0: Any) -> tuple[Loop, Any]:
-    """The loop and the start with z as their last state; unchanged if the discount is a number."""
+    """The loop and its start with z appended to the state; unchanged if the discount is a constant."""
     problem = loop.problem
     if not callable(problem.discount):
         return loop, x0

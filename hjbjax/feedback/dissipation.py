@@ -128,7 +128,8 @@ def dissipation(
       The energies of k (1 + random + given) paths and their margins; ``print`` shows the tightest margin of each kind.
 
     Raises:
-      ValueError: no disturbances, random ones of a finite set, noise, a marched solution, or starts outside the grid.
+      ValueError: the problem has no disturbances, or has noise; random disturbances are requested from a finite set;
+        the solution was marched; or a start is outside the grid.
       TypeError: a signal that cannot be called.
 
     Example:
@@ -154,7 +155,7 @@ def dissipation(
             found.append(_energies_under(problem, solution, given, starts, times, rtol))
         output, total, ends, codes = (np.concatenate(each) for each in zip(*jax.device_get(found), strict=True))
         stored = np.asarray(solution.value_at(starts))
-    count = len(output) // len(starts)  # paths per initial state; all initial states follow under each disturbance
+    count = len(output) // len(starts)  # paths per initial state; each disturbance has one path from every state
     statuses = tuple(PathStatus(int(code)) for code in codes)
     # a path that becomes infinite ends at its last finite state, whose energies do not cover the whole duration
     output = np.where([status is PathStatus.NONFINITE for status in statuses], np.nan, output)

@@ -387,5 +387,5 @@ def _middle(action: list[Array], dtype: DType, n: int) -> jax.Array:
     """An action at the middle node of the block of 3^n, as one array of shape (m,)."""
     if not action:
         return jnp.zeros(0, dtype)
-    # an input that does not depend on the node is a number; one that varies along an axis broadcasts
+    # an input that does not depend on the node is a number; an input that varies along an axis only broadcasts
     return jnp.stack([jnp.broadcast_to(jnp.asarray(entry, dtype), (3,) * n)[(1,) * n] for entry in action])

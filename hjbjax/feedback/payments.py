@@ -1,4 +1,4 @@
-"""Payments of a path besides its running cost, stopping, tubes, and the comparison of the cost with V.
+"""The payments of a path in addition to its running cost, stopping, tubes, and a comparison of the cost with V.
 
     cost = ∫ e^{−βt} L dt + e^{−βτ} · { exit cost on the target; ψ where V = ψ; V(T, ·) at the horizon T of a march }
 
@@ -141,8 +141,8 @@ def promise(feedback: object, start: Array, t: float = 0.0) -> float | None:
 def still_ahead(problem: Problem, feedback: object, path: Path, weight: float, *, to_horizon: bool) -> float | None:
     """The cost that V predicts after the end of a short path, discounted to the start of the path.
 
-    An undiscounted path that rests or circles outside the target never gets what V promised, so nothing is added. None
-    if V does not predict the cost that follows.
+    An undiscounted path that rests or circles outside the target never achieves the V that was promised, so nothing is
+    added. None if V does not predict the cost that follows.
 
     Args:
       problem: the simulated problem.
@@ -175,7 +175,7 @@ def _rests(path: Path, grid: Grid) -> bool:
 
 
 def _goes_round(path: Path, solution: Solution) -> bool:
-    """True if a path returns in its second half to an earlier state, and V fell since by no more than its error."""
+    """True if a path returns to an earlier state in its second half, and V fell in between by at most its error."""
     grid, late = solution.grid, path.states[len(path.states) // 2 :]
     value = solution.value_at(late, clamp=True)
     if not value[0] - value[-1] <= _grid_error(solution):
@@ -189,7 +189,7 @@ def _goes_round(path: Path, solution: Solution) -> bool:
 
 
 def _comes_back(apart: np.ndarray, far: float, near: float) -> bool:
-    """True if distances from the last state were small before the last time at which they were large."""
+    """True if the path was close to its last state, then far from it, and came back."""
     away = np.flatnonzero(apart > far)
     return bool(away.size and np.any(apart[: away[-1]] <= near))
 

@@ -70,7 +70,7 @@ def simulate(
         cost of the best moment to stop.
         A marched Solution must be stored at enough times: at least ten over the duration. A path as long as the horizon
         pays at its end what ``march`` assumed there: ``start``, the terminal cost, else ψ, else g.
-        After a function the terminal cost is paid at the end.
+        If the feedback is a function, the terminal cost is paid at the end.
       x0: the state at time 0, shape (n,).
       duration: the length of the path unless it reaches the target earlier, in units of time.
 

@@ -319,7 +319,8 @@ def _common_axes(sensor: Sensor, looks: jax.Array, states: int) -> np.ndarray:
     weights = [1 / np.sqrt(2 + k) for k in range(len(covariances))]
     size = max(max(np.abs(each).max() for each in covariances), np.finfo(float).tiny)
     mixed = sum(w * c for w, c in zip(weights, covariances, strict=True)) / size
-    # subtracting the ones moves their eigenvalue far below all others, so it comes first and is left out
+    # subtracting a matrix of ones moves the eigenvalue of the vector of ones far below all others, so it comes first
+    # and can be left out
     _, vectors = np.linalg.eigh(mixed - np.ones((states, states)))
     basis = vectors[:, 1:].T[::-1].copy()
     # the sign of an eigenvector is arbitrary and depends on the machine: make the largest entry positive

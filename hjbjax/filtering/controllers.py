@@ -67,7 +67,7 @@ class AveragedHamiltonian:
         """The control, shape (m,); NaN if the density is not a law."""
         self.observer.check_state(information)
         # compiled even if the caller does not compile. Cast to one type, because JAX 0.10 confuses programs with NumPy
-        # float64 constants that were traced in a 64-bit ``jit`` with 32-bit ones
+        # float64 constants traced in 64 bits with programs traced in 32 bits
         return _least(cast(self, information.density.dtype), information)
 
     def _least(self, information: Density) -> Array:

@@ -209,7 +209,7 @@ class GridFilter:
 
     @front_door
     def estimate(self, state: Density) -> State:
-        """The mean, shape (n,); along periodic axes the circular mean, in the box. See ``zakai``."""
+        """The mean, shape (n,); along periodic axes the circular mean, inside the box. See ``zakai``."""
         return forward_equation.mean(self.grid, self.probability(state))
 
     @front_door

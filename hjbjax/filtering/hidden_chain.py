@@ -213,7 +213,7 @@ def simulate_hidden(
     """Paths of a hidden chain under a control that depends only on the belief, in float64; batched over keys.
 
     At the ends of the steps the chain has its exact law under the control of each step. In a step with a jump the
-    measurement and the cost are the mean of the two states, an error of order dt² in the mean.
+    measurement and the cost are averaged over the two states. The error of this is of order dt² in the mean.
 
     Args:
       observer: the filter, with the generator and the sensor of the chain.

@@ -70,7 +70,8 @@ def simulate_output(
         method ``judge(path)``, it is called with the result and may warn, as ``minimum_stress`` does.
 
     Keyword Args:
-      h: the measured function of one state, returns shape (p,). It belongs to the plant; the observer's may differ.
+      h: the measured function of one state, returns shape (p,). It belongs to the plant; the h of the observer may
+        differ.
       x0: the state of the plant at t = 0, shape (n,), or (batch, n) with one state per path.
       duration: the length of the paths, in units of time.
       dt: the time between two updates; the last interval may be shorter.
@@ -182,7 +183,7 @@ def _keys(given: Any, paths: int | None, batch: tuple[int, ...]) -> Key:
 
 
 def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
-    """The problem with its functions as they are now, after checks that it is a plant of n states with an observer."""
+    """Check that a problem is a plant of n states with an observer; return it with its functions as they are now."""
     if not isinstance(problem, Problem):
         raise TypeError(f"simulate_output: got {type(problem).__name__}, wanted a Problem")
     if problem.is_game or problem.running_max is not None:

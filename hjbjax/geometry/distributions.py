@@ -237,7 +237,7 @@ def _span_of_generations(generations: Generations, x: State, tolerance: Number) 
     spans = jax.vmap(lambda kept: span(jnp.where(kept[:, None], vectors, 0), tolerance, sizes))(first)
     counted = jax.vmap(lambda one: one.counted)(spans)
     best = jnp.argmax(jnp.sum(counted, axis=-1))
-    # the residue of the verdict is the largest singular value in any of the spans that does not count
+    # the residue of the verdict is the largest singular value, over all spans, that does not count
     shares = spans.singular_values / jnp.where(spans.singular_values[:, :1] > 0, spans.singular_values[:, :1], 1)
     chosen = spans.singular_values[best]
     beside = jnp.where(counted, 0, shares).max(axis=0) * chosen[0]

@@ -130,7 +130,8 @@ class DiscreteHamiltonian:
 def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
     """A Hamiltonian with slopes D⁺ = s_i and D⁻ = −s_i everywhere: H = L + Σ s_i |f_i| plus the noise terms.
 
-    With s > 0, shape (n,), its minimum is zero exactly where an action rests at no cost, if the cost is not negative.
+    With s > 0, shape (n,), its minimum is zero if and only if some action rests at no cost, provided that the cost is
+    not negative.
     """
     hamiltonian = around(on, jnp.zeros(on.grid.shape, slopes.dtype))
     one = jnp.ones(on.grid.shape, slopes.dtype)

@@ -1,8 +1,8 @@
 """The optimum of the discrete Hamiltonian over the admissible sets: min, max, min max and max min, node by node.
 
-Exact if the drift is affine in u, the cost quadratic and the noise independent of u, by ``exact``. For convex costs any
-number of inputs and any coupling is allowed (see ``players``). A finite set is enumerated. Otherwise samples and a
-pattern search are used, which may miss the optimum: such solves have no certified bounds.
+It is exact if the drift is affine in u, the cost quadratic and the noise independent of u, see ``exact``. For convex
+costs any number of inputs and any coupling is allowed (see ``players``). A finite set is enumerated. Otherwise samples
+and a pattern search are used, which may miss the optimum: such solves have no certified bounds.
 """
 
 from collections.abc import Callable

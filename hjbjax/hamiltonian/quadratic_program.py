@@ -6,7 +6,7 @@ In unit variables, v in [-1, 1]^m or |v| <= 1, the objective at a node is
 
 with one term per kink of a gain. A kink is convex or concave according to the sign of its jump.
 
-- Concave kinks: min(0, jump (a·v + c)) is the lesser of two affine functions, and minima commute. Every choice is
+- Concave kinks: min(0, jump (a·v + c)) is the smaller of two affine functions, and minima commute. Every choice is
   tried, even if v is then on the other side of the kink. A component with c concave kinks has c + 1 choices.
 - Convex kinks: jump max(a·v + c, 0) is the maximum of s (a·v + c) over 0 <= s <= jump, so that each choice is a convex
   program. A primal-dual interior-point method solves it for all nodes at once in 15 to 25 steps. Newton steps on the
@@ -137,7 +137,7 @@ def _derivative(axes: tuple[int, ...], ball: bool, primals: tuple, tangents: tup
     scaled, size, width, met = _scaled(program, ball)
     best = _best(scaled, axes, ball)
     (v, s, slack, dual), stiff = best.point, _stiffness(best.value.dtype)
-    # the changes in the units of the program, which are constants
+    # the changes in the units of the scaled program, which are constants
     slope, bend, rows, offsets = (
         moves.slope / size, moves.bend / size, moves.rows / width[:, None], moves.offsets / width,
     )  # fmt: skip

@@ -120,7 +120,7 @@ def _inputs(player: Player) -> list[Input]:
 
 
 def _implicit(at: Optimum, inputs: Sequence[Input]) -> tuple[Action, Action]:
-    """Both actions with the derivatives of ``inputs``."""
+    """Both actions, with derivatives in the entries of ``inputs``."""
     u, d = at.u, at.d
     if not inputs:
         return u, d
@@ -223,7 +223,7 @@ class Kinks:
 
 
 def _kinks(at: Optimum, inputs: Sequence[Input], kinked: Sequence[Any]) -> Kinks:
-    """The kinks of the components that an input drives, for each player separately if their drifts are."""
+    """The kinks of the components that an input drives; for each player if drifts are upwinded separately."""
     driven = {i for each in inputs for i in each.player.driven[each.index]}
     if callable(at.moving.on.problem.noise):  # a may change with an input that does not drive f
         driven = set(range(at.moving.on.grid.ndim))

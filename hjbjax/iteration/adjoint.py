@@ -260,8 +260,8 @@ def _high_order_solvers(equation: PolicyEquation, grid: Grid) -> tuple[LinearSol
 def _tied_to_constraints(equation: PolicyEquation, obstacles: Obstacles, value: Field) -> PolicyEquation:
     """The linear equation of a policy, with every node whose value equals a constraint assigned to that constraint.
 
-    Where continuing is equally good both branches hold. On a plateau without discount only the constraint has a
-    derivative, since a policy may cycle there indefinitely.
+    Where continuing is as good as the constraint, both branches hold. On a plateau without discount only the constraint
+    has a derivative, since a policy may cycle there indefinitely.
     """
     free = jnp.ones(value.shape, bool)
     for constraint in (obstacles.upper, obstacles.lower):

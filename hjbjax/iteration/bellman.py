@@ -219,7 +219,7 @@ def policy_equation(
     """The linear equation for δ under one policy; the active branch of the constraints is chosen at every node.
 
     Rates that are small compared with the largest Q + β are rounding, and do not count unless ``every_rate`` is true.
-    This number, ``fastest``, saves a pass over the nodes if it is known for the same policy and time.
+    ``fastest`` is the largest Q + β, if it is known for the same policy and time; it saves a pass over the nodes.
     """
     u, d = list(policy.controls), list(policy.disturbances)
     rates = jump_rates(on, u, d)

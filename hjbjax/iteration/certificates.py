@@ -78,7 +78,7 @@ class Iterate:
       policy: the greedy policy at V with its defect r, zero at fixed nodes.
       equation: its correction equation, whose source is the residual.
       obstacles: fixed nodes and constraints.
-      counted: bool (*grid), the nodes whose error counts (those that reach the target).
+      counted: bool (*grid), the nodes whose error counts (the nodes that reach the target).
     """
 
     layout: Layout
@@ -158,7 +158,7 @@ def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
         shift = jnp.minimum(shift, obstacles.upper - value)
     if obstacles.lower is not None:
         shift = jnp.maximum(shift, obstacles.lower - value)
-    # at fixed nodes r is zero, the constraints need not be; V is exact there
+    # at fixed nodes V is exact; r is zero there, but ψ − V and g − V may differ from zero
     shift = jnp.where(obstacles.fixed, 0, shift)
     return layout.least(shift), layout.largest(shift)
 

@@ -1,8 +1,8 @@
 """The damping of a high-order iteration by the sizes of its corrections.
 
-Corrections are halved, at most three times, if neither of the last two was smaller than all before them and V turned
-back. This ends limit cycles of the limiter. Halving from the start takes a third more steps. Halving in slow monotone
-convergence took the Dubins car on 41³ nodes 135 steps instead of 33.
+Corrections are halved, at most three times, if V turned back and neither of the last two corrections was smaller than
+all earlier ones. This ends limit cycles of the limiter. Halving from the start would take a third more steps. Halving
+during slow monotone convergence would take 135 steps instead of 33 for the Dubins car on 41³ nodes.
 """
 
 import jax
@@ -13,7 +13,7 @@ from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Field, Scalar
 
 LEAST_SHARE, CALM = 0.125, 5
-SLOWEST = 0.95  # contraction rate beyond which the step size does not measure the distance; it then counts twentyfold
+SLOWEST = 0.95  # upper limit of the contraction rate ρ; the distance is then estimated as 20 times the step
 
 
 @pytree_dataclass()
@@ -21,10 +21,10 @@ class Moves:
     """The sizes of the corrections, cost units, and the resulting damping.
 
     Args:
-      last: the last two, the latest first, scaled as if each had been taken whole; infinite if there was none.
-      least: the smallest one before the last two.
-      share: the fraction of a correction that is taken.
-      since: number of steps since ``share`` changed.
+      last: the sizes of the last two full corrections, before damping, latest first; infinite if there was none.
+      least: the smallest size before the last two.
+      share: the damping, the fraction of a correction that is applied.
+      since: the number of steps since ``share`` changed.
     """
 
     last: jax.Array
@@ -49,12 +49,12 @@ class Moves:
         """The distance from V to the limit of its iteration, cost units: step/(1 − ρ), with the observed contraction ρ.
 
         Args:
-          moved: the size of the last correction, as taken; the other ones are those before it.
-          rounding: the size below which a step is rounding, does not contract and does not count, cost units.
+          moved: the size of the last correction as applied; ``last`` has the sizes of the two before it.
+          rounding: a smaller step is a rounding error, which does not contract and is not counted, cost units.
         """
         step, before = moved / self.share, self.last
         known = jnp.isfinite(before) & (before > 0)
-        # over one step and over two, since two eigenvalues of opposite signs make every other step short
+        # over one step and over two, because eigenvalues of opposite signs make every other step short
         ratios = jnp.where(known, step / jnp.where(known, before, 1), 0) ** jnp.array([1.0, 0.5], step.dtype)
         rate = jnp.where(jnp.isfinite(before[0]), jnp.max(ratios), SLOWEST)
         rate = jnp.clip(rate, 0, SLOWEST)

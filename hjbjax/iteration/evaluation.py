@@ -56,9 +56,9 @@ class Evaluation(abc.ABC):
 
     @property
     def rough(self) -> bool:
-        """True if it only relaxes: steps are cheap, and the loop switches to a linear solve if it stalls.
+        """True if the evaluation only relaxes. Steps are cheap, and the loop switches to a linear solve if it stalls.
 
-        For other evaluations the residual is checked. If they fail, for example for a policy without a value, the
+        The residual of other evaluations is checked. If one fails, for example because the policy has no value, the
         equation is relaxed instead.
         """
         return False
@@ -95,8 +95,8 @@ class Evaluation(abc.ABC):
 class Sweeps(Evaluation):
     """Approximate evaluation by Gauss–Seidel: ``count`` forward and backward sweeps in every order of the axes.
 
-    The work is about equal to ``count`` 2^n relaxations of every node. Runs in float32 on the correction. If the grid
-    exceeds the cache of a CPU, each slab of it is swept 2 ``count`` - 1 times (at least three) in each of two
+    The work is about equal to ``count`` 2^n relaxations of every node. The correction is computed in float32. If the
+    grid exceeds the cache of a CPU, each slab of it is swept 2 ``count`` - 1 times (at least three) in each of two
     directions.
     """
 
@@ -141,7 +141,7 @@ class Krylov(Evaluation):
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """BiCGStab on (I − W) δ = s with one Gauss–Seidel round as preconditioner."""
 
-        def matvec(delta: Field) -> Field:  # (I − W) δ: the residual of a zero right-hand side, negative
+        def matvec(delta: Field) -> Field:  # (I − W) δ: minus the residual for a zero source
             return -left_over(PolicyEquation(jnp.zeros_like(delta), equation.weights), grid, delta)
 
         def precondition(residual: Field) -> Field:

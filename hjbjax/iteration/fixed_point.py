@@ -1,11 +1,11 @@
 """Value iteration and policy iteration as one loop.
 
-Every method repeats the same step. At V the greedy policy leaves a residual; the linear equation of that policy gives a
-correction δ; V + δ is the next value. The methods differ in how accurately they solve the equation: value iteration
-uses its diagonal with the largest rate (monotone, a contraction), modified policy iteration a few Gauss–Seidel sweeps,
-policy iteration (Howard; semismooth Newton) a linear solve. For games see ``methods``.
+Every method repeats the same step. At V the greedy policy leaves a residual. The linear equation of that policy gives a
+correction δ, and V + δ is the next value. The methods differ in how accurately they solve the equation. Value iteration
+divides by the largest diagonal over the actions (monotone, a contraction), modified policy iteration uses a few
+Gauss–Seidel sweeps, and policy iteration (Howard; semismooth Newton) uses a linear solve. For games see ``methods``.
 
-The loop stops by the certificate of the value it returns, not by the size of a step; NaN is never convergence.
+The loop stops by the certificate of the value that it returns, not by the size of a step. NaN never converges.
 
 A pass of the loop corrects the last evaluated value and evaluates the result: its policy, its bound and the status. The
 first pass evaluates the guess, without a correction. All passes are one program, since a program that only evaluates
@@ -38,7 +38,7 @@ from hjbjax.problem.pytree import altered, is_traced, pytree_dataclass
 from hjbjax.problem.types import Field, Nodes, Number, Scalar
 from hjbjax.solution.status import Status
 
-FEW = 4  # ``progress.ROUNDING`` of a solve that stores only V, whose steps are small at slow nodes
+FEW = 4  # replaces ``progress.ROUNDING`` if a solve stores only V, because its steps are small at slow nodes
 
 
 @pytree_dataclass(static=("certificate", "has_lost", "bare", "mesh"))
@@ -54,14 +54,14 @@ class Task(GridTask):
       outflow: max Q + β at each node, for value iteration and for open ends; else None.
       tol: certified error to reach, cost units.
       certificate: the applicable error bound.
-      crossing: the time to cross the box at the largest speeds, if it was computed; else None.
-      has_lost: True if nodes that do not count may be next to others, so that no action may lead there.
+      crossing: the time to cross the box at the largest speeds; None if it was not computed.
+      has_lost: True if nodes that do not count may be next to nodes that count; no action may then lead to them.
       bare: True if only V is stored; then ``obstacles`` is empty and recomputed in every step.
-      first_order: a truth value, which may be traced: solve the chain of a high-order scheme, so that one program
-        serves both; None: always the scheme itself. Only without noise.
+      first_order: true to solve the chain of a high-order scheme instead of the scheme. It may be traced, so that one
+        program solves both. None: always the scheme itself. Only without noise.
       floor: a lower bound on all values, cost units, for a high-order scheme; None if there is none.
-      shift: an addition to the discount in high-order corrections, per unit time; None: nothing.
-      mesh: the devices over which the nodes are divided during the iteration; None: one device.
+      shift: an addition to the discount in high-order corrections, per unit time; None for zero.
+      mesh: the devices over which the nodes are divided during the iteration; None for one device.
     """
 
     on: Discretisation
@@ -91,7 +91,7 @@ class Task(GridTask):
 
     @property
     def is_chain(self) -> Any:
-        """True if the chain, which has the certificate, is solved; traced if one program serves both."""
+        """True if the chain, which has the certificate, is solved; traced if one program solves both."""
         return self.scheme.monotone if self.first_order is None else self.first_order
 
     @property
@@ -106,7 +106,7 @@ class Task(GridTask):
 
     @property
     def counting(self) -> jax.Array | bool:
-        """The nodes whose value counts; the constant True if all do, which saves a pass over them."""
+        """The nodes whose value counts, bool (*grid); the constant True if all count, which saves a pass."""
         return self.counted if self.has_lost else True
 
     @property
@@ -116,7 +116,7 @@ class Task(GridTask):
 
     @property
     def by_defect(self) -> bool:
-        """True if neither a step nor its bound requires the actions, so that they are computed once, at the end."""
+        """True if neither a step nor its bound requires the actions, which are then computed once, at the end."""
         additive = self.certificate is Certificate.ADDITIVE and self.first_order is None
         if not (self.method.by_defect and additive) or self.bare:
             return False
@@ -134,7 +134,7 @@ class Task(GridTask):
         value = self.given.impose(value)
         if not self.has_lost:
             return value
-        # 1/√eps above: no minimum selects it, and a difference with it still has half of its digits
+        # larger by 1/√eps: no minimum selects it, and differences with it keep half of their digits
         largest = self.layout.largest(jnp.where(self.counted, jnp.abs(value), 0))
         return jnp.where(self.counted, value, largest / jnp.sqrt(jnp.finfo(value.dtype).eps))
 
@@ -144,7 +144,7 @@ class Task(GridTask):
         return self.certificate is Certificate.ADDITIVE
 
     def equation(self, value: Field, policy: Greedy, fastest: Scalar | None = None) -> PolicyEquation:
-        """The linear equation of a policy; ``fastest``, its largest Q + β, saves a pass if known."""
+        """The linear equation of a policy; a known ``fastest``, the policy's largest Q + β, saves a pass."""
         return bellman.policy_equation(
             self.on, value, policy, self.obstacles, fastest=fastest, every_rate=self.every_rate
         )
@@ -166,7 +166,7 @@ class Task(GridTask):
         return self.layout.largest(jnp.where(self.counting, jnp.abs(equation.source), 0))
 
     def start(self) -> Field:
-        """The value without a guess: zero, or without discount ψ, above all fixed points, or g, below them."""
+        """The value without a guess: zero, or without a discount ψ (above all fixed points) or g (below them)."""
         zero = jnp.zeros(self.grid.shape, self.tol.dtype)
         if not self.constrained or self.certificate is Certificate.ADDITIVE:
             return zero
@@ -230,7 +230,7 @@ def run(task: Task, state: State, until: Number) -> State:
     if not task.by_defect:
         return state
     policy = bellman.greedy(task.on, state.value, task.obstacles.fixed)
-    # the next chunk continues with the defect of the steps, from which that of the actions may differ by rounding
+    # the next chunk continues with the defect of the steps; the defect of the actions may differ by rounding
     return dataclasses.replace(state, policy=dataclasses.replace(policy, defect=state.policy.defect))
 
 
@@ -250,7 +250,7 @@ def _advance(task: Task, state: State, chunk: Scalar) -> State:
     moved = task.layout.largest(jnp.abs(change))
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
-    moved = jnp.where(first, jnp.inf, moved)  # without a step there is no measure of the distance
+    moved = jnp.where(first, jnp.inf, moved)  # the guess was not reached by a step, so its distance cannot be estimated
     moves, distance = state.moves, moved
     if not task.scheme.monotone:
         rounding = FEW * jnp.finfo(value.dtype).eps * task.size(value)
@@ -265,10 +265,10 @@ def _advance(task: Task, state: State, chunk: Scalar) -> State:
 
 
 def _relaxed(task: Task, state: State, chunk: Scalar) -> State:
-    """One relaxation of every node, storing only V, with the bound on the value before it."""
+    """One relaxation of every node that stores only V; the bound belongs to the value before the relaxation."""
     value = task.impose(state.value)  # a guess need not have the fixed values
     step, bound = certificates.of_relaxation(task.certificate, task.on, value)
-    # the bound on the next value would require an array of its own
+    # the bound on the value after it would require another array
     first, measured = _is_first(state), state.progress.measure(bound, chunk)
     after = jnp.where(first, value, task.impose(value + step))
     moved = jnp.where(first, jnp.inf, task.layout.largest(jnp.abs(after - state.value)))
@@ -311,7 +311,7 @@ def status_after(task: Task, value: Field, bound: ErrorBound, measured: Progress
     longest: Number = task.method.patience(undivided(task.grid))
     climbs = task.constrained or task.method.relaxes
     to_the_end = climbs and task.certificate in (*TO_THE_END, Certificate.OPEN)
-    if to_the_end:  # a front moves V at every node by the spacing times the slope, one step after the other
+    if to_the_end:  # a front changes V at one node after the other, by the spacing times the slope
         longest = jnp.maximum(longest, 100 + 4 * math.prod(task.layout.whole))
     best, since = measured.best, measured.since_best
 
@@ -327,7 +327,7 @@ def status_after(task: Task, value: Field, bound: ErrorBound, measured: Progress
         # a residual that is rounding cannot fall further: ten steps suffice, instead of thousands for a slow climb
         patience = jnp.where(bound.residual <= rounding, progress.PATIENCE, longest)
         halted: Any = Status.STALLED
-        if to_the_end and task.bare:  # in a sum of many terms more than a few units may remain
+        if to_the_end and task.bare:  # sums of many terms may leave more than a few units in the last place
             halted = jnp.where((bound.residual <= rounding) & ~(task.problem.discount > 0), Status.CONVERGED, halted)
         code = jnp.where(since >= patience, halted, Status.RUNNING)
         grew = bound.residual > progress.GROWTH * jnp.maximum(best[1], rounding)
@@ -336,16 +336,17 @@ def status_after(task: Task, value: Field, bound: ErrorBound, measured: Progress
         return converged(jnp.where(grew, Status.DIVERGED, code), tol)
 
     if not to_the_end:
-        # the size of V does not affect the status; a cond, because its result is not recomputed by later selects
+        # the size of V is computed only if it matters; in a cond, which later selects do not recompute
         matters = (since >= jnp.minimum(progress.PATIENCE, longest)) | (bound.residual > progress.GROWTH * best[1])
         return jax.lax.cond(matters, by_size, lambda: converged(Status.RUNNING, task.tol))
     return _status_of_tube(task, moved, by_size())
 
 
 def _status_of_tube(task: Task, moved: Number, code: Scalar) -> Scalar:
-    """The status after a step; a tube in which nothing moved has converged, whatever the residual of a slow node.
+    """The status after a step. A tube in which no value moved has converged, even if a slow node has a residual.
 
-    The residual is relative to the node's own rate, the step to the fastest rate: it may be below the last place of V.
+    The residual is relative to the node's own rate and the step to the fastest rate, so the step of a slow node may be
+    below the last place of V.
     """
     if not (task.constrained and task.method.relaxes and task.certificate in TO_THE_END):
         return code
@@ -359,7 +360,7 @@ def nonfinite_nodes(task: Task, state: State) -> jax.Array:
         return ~jnp.isfinite(bellman.relaxation(task.on, task.impose(state.value))[0])
     before = dataclasses.replace(state.progress, evaluations=state.progress.evaluations - 1)
     state = dataclasses.replace(state, progress=before)
-    if task.by_defect:  # the defect is that of the undone step
+    if task.by_defect:  # the stored defect belongs to the undone step
         state = dataclasses.replace(state, policy=bellman.greedy(task.on, state.value, task.obstacles.fixed))
     value = task.impose(state.value + _correction(task, state))
     rate = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost, first_order=task.first_order).defect
@@ -413,7 +414,7 @@ class _At:
         return self.task.equation(self.state.value, self.state.policy, self.state.fastest)
 
     def relaxed(self) -> Field:
-        """r/(Q + β) for the fastest action; without ``outflow`` the policy's own rate is used."""
+        """r/(Q + β), with the largest rate: of the actions behind ``outflow``, or of the policy if it is larger."""
         task, policy, players = self.task, self.state.policy, self.task.on.players
         assert task.outflow is not None
         if players.control.fastest_at_ends and players.disturbance.fastest_at_ends:
@@ -422,9 +423,9 @@ class _At:
         return policy.defect / jnp.maximum(task.outflow, chosen + task.problem.discount)
 
     def evaluated(self, evaluation: Evaluation, replies: int) -> Field:
-        """The correction of policy iteration: solves the policy's linear equation, in a game the inner problem."""
+        """The correction of policy iteration, by the policy's linear equation, or by the inner problem of a game."""
         task, state = self.task, self.state
-        if task.certificate is Certificate.OPEN:  # also in a game: steps in time improve both players at once
+        if task.certificate is Certificate.OPEN:  # also in a game, where steps in time improve both players at once
             later = altered(task.problem, discount=task.problem.discount + _shift(task, state))
             return evaluate(evaluation, task.asking(later).equation(state.value, state.policy), task.grid)
         if task.problem.is_game:
@@ -441,7 +442,7 @@ class _At:
 def _correction(task: Task, state: State) -> Field:
     """The correction δ of the method, cost units, (*grid); zero for a guess, which has no policy."""
     stay, first = jnp.zeros_like(state.value), _is_first(state)
-    if task.method.relaxes:  # one pass, while a cond would take two
+    if task.method.relaxes:  # a cond would take two passes over the nodes instead of one
         return jnp.where(first, stay, _by_method(task, state))
     return jax.lax.cond(first, lambda: stay, lambda: _by_method(task, state))
 

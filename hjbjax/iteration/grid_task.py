@@ -20,7 +20,7 @@ class GridTask:
 
     Attributes:
       on: the problem on its grid.
-      mesh: the devices over which the nodes are divided during the iteration; None: one device.
+      mesh: the devices over which the nodes are divided during the iteration; None for one device.
     """
 
     on: Discretisation
@@ -43,7 +43,7 @@ class GridTask:
 
     @property
     def division(self) -> Layout:
-        """The layout of the iteration: parts over the mesh, or one device, also for grids too small to divide."""
+        """The layout of the iteration: parts over the mesh; one device without a mesh, or if the grid is too small."""
         parts = None if self.mesh is None else Parts(self.grid.shape, self.mesh)
         return parts if parts is not None and parts.fits else self.layout
 
@@ -52,12 +52,12 @@ class GridTask:
         return altered(self, on=altered(self.on, grid=placed(self.grid, layout)))
 
     def over_nodes(self: T, shape: tuple[int, ...]) -> T:
-        """Mark the leaves that have a value at every node, that is, have this ``shape``."""
+        """A tree of bools, True for leaves with a value at every node, that is, leaves of this ``shape``."""
 
         def mark(leaf: Any) -> bool:
             return np.shape(leaf) == shape
 
-        # except the leaves of the problem and the grid, which may have this shape by chance
+        # leaves of the problem and the grid may have this shape by chance, so they are False
         marked = jax.tree.map(mark, altered(self, on=altered(self.on, problem=None, grid=None)))
         problem, grid = jax.tree.map(lambda _: False, (self.problem, self.grid))
         return altered(marked, on=altered(marked.on, problem=problem, grid=grid))

@@ -68,7 +68,7 @@ class Step(Protocol):
         """r/(Q + β), with the rate of the fastest action: one relaxation of every node, (*grid)."""
 
     def evaluated(self, evaluation: Evaluation, replies: int) -> jax.Array:
-        """The correction that makes V approximately the value of its greedy policy; in a game of the outer player's."""
+        """The correction that makes V approximately the value of its greedy policy; in a game, of the outer policy."""
 
 
 class Method(abc.ABC):
@@ -113,7 +113,7 @@ class Method(abc.ABC):
         return False
 
     def filled(self, evaluation: Evaluation) -> "Method":
-        """The method with the evaluation that suits the problem, if its own is open."""
+        """The method with the evaluation that suits the problem, unless it has its own."""
         return self
 
     @abc.abstractmethod
@@ -179,7 +179,7 @@ class PolicyIteration(Method):
 
     @property
     def in_parts(self) -> bool:
-        """True if the evaluation supports divided nodes; an open choice is made among those that do."""
+        """True if the evaluation supports divided nodes; without an evaluation, one that supports them is chosen."""
         return self.evaluation is not None and self.evaluation.in_parts
 
     def __post_init__(self) -> None:
@@ -188,7 +188,7 @@ class PolicyIteration(Method):
         arguments.count(self.replies, "PolicyIteration: replies")
 
     def filled(self, evaluation: Evaluation) -> "PolicyIteration":
-        """The method with this evaluation, if its own is open."""
+        """The method with this evaluation, unless it has its own."""
         return PolicyIteration(self.evaluation or evaluation, self.replies)
 
     def correct(self, step: Step) -> jax.Array:

@@ -1,7 +1,7 @@
-"""The record of an iteration: its evaluated values, its least error and residual, its status.
+"""The record of an iteration: the number of evaluated values, the least error and residual, and the status.
 
-An iteration evaluates a guess and then one value per step. An evaluation measures the error and the residual of a
-value. It is progress if either of the two is less than ever before.
+An iteration evaluates a guess and then one value per step. Each evaluation measures the error and the residual of a
+value. It counts as progress if the error or the residual is smaller than in all earlier evaluations.
 """
 
 import dataclasses
@@ -18,10 +18,10 @@ from hjbjax.solution.status import Status
 
 S = TypeVar("S")
 
-HISTORY = 256  # largest number of evaluations per chunk, whose residuals are recorded
-GROWTH = 1e6  # growth of a residual over its smallest value that means divergence
-PATIENCE = 10  # steps without progress if the residual is rounding
-ROUNDING = 64  # in units in the last place of max|V|: smaller residuals are rounding
+HISTORY = 256  # largest number of evaluations per chunk; the residual of each is recorded
+GROWTH = 1e6  # an iteration diverges if its residual exceeds the smallest one by this factor
+PATIENCE = 10  # steps without progress before the iteration stops, if the residual is rounding
+ROUNDING = 64  # units in the last place of max|V|; a smaller residual is rounding
 
 
 @pytree_dataclass()
@@ -33,7 +33,7 @@ class Progress:
       best: the least error and the least residual so far, (2,).
       since_best: the number of evaluations since either of them decreased.
       code: the status.
-      history: the residuals of this chunk, (HISTORY,); the other entries are −1.
+      history: the residuals of this chunk, (HISTORY,); unused entries are −1.
     """
 
     evaluations: Scalar
@@ -53,7 +53,7 @@ class Progress:
         return int(self.evaluations) > 0
 
     def is_running(self, until: Number) -> jax.Array:
-        """True if the iteration goes on, and fewer than ``until`` values have been evaluated."""
+        """True if the status is RUNNING and fewer than ``until`` values have been evaluated."""
         return (self.code == Status.RUNNING) & (self.evaluations < until)
 
     def measure(self, bound: ErrorBound, chunk: Scalar) -> "Progress":
@@ -76,13 +76,13 @@ def no_progress(dtype: DType, xp: Any = np) -> Progress:
 
 
 def no_bound(dtype: DType, xp: Any = np) -> ErrorBound:
-    """The bound on a value that has not been evaluated: it may be anything."""
+    """The error bound of a value that has not been evaluated: infinite."""
     infinite = xp.asarray(xp.inf, dtype)
     return ErrorBound(-infinite, infinite, xp.zeros((), dtype), infinite, infinite)
 
 
 def keep_finite(code: Scalar, after: S, before: S) -> S:
-    """The state after a step, or the one before it if the step led to numbers that are not finite."""
+    """The state after a step, or the state before it if the step produced numbers that are not finite."""
     return jax.tree.map(lambda new, old: jnp.where(code == Status.NONFINITE, old, new), after, before)
 
 

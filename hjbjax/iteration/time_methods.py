@@ -240,7 +240,7 @@ class Explicit(TimeMethod):
         return self.fraction / self.tableau.euler
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Explicit":
-        """The method with the stages of the scheme, if its own are open; its numbers in the dtype of the march."""
+        """The method with the stages of the scheme, unless it has its own; its numbers in the dtype of the march."""
         return Explicit(self.stages or on.scheme.stages, _as(self.fraction, on.dtype))
 
     def step(self, march: Marching, value: Field, t: Number, end: Number, dt: Number) -> tuple[Field, Scalar, Any]:
@@ -296,7 +296,7 @@ class Implicit(TimeMethod):
         arguments.count(self.max_steps, "Implicit: max_steps")
 
     def filled(self, on: Discretisation, evaluation: Evaluation | None = None) -> "Implicit":
-        """The method with this evaluation, if its own is open; its numbers in the dtype of the march."""
+        """The method with this evaluation, unless it has its own, and its numbers in the dtype of the march."""
         tol = None if self.tol is None else _as(self.tol, on.dtype)
         return Implicit(self.evaluation or evaluation, tol, self.max_steps)
 
@@ -321,7 +321,7 @@ class Implicit(TimeMethod):
 
 
 def _elapsed(problem: Problem, share: Scalar, length: Scalar, dt: Number) -> tuple[Scalar, Scalar | float]:
-    """The time since a step began at a fraction of its length S in s, and the factor 1/(1 − β s) there."""
+    """τ at a fraction of the step's length S in s, and the factor 1/(1 − β s) there."""
     if problem.discounted is False:
         return share * dt, 1.0
     discount = jnp.asarray(problem.discount, length.dtype)
@@ -461,7 +461,7 @@ class ImplicitStep:
         return dataclasses.replace(policy, defect=jnp.where(self.obstacles.fixed, 0, policy.defect + self.arriving))
 
     def _evaluated(self, value: Field, policy: Greedy, goal: Number, evaluation: Evaluation) -> Field:
-        """The value of the policy, approximately; in a game of the outer player's policy."""
+        """The approximate value of the policy, or of the outer player's policy in a game."""
         if self.on.problem.is_game:
             return methods.evaluated(self, value, policy, evaluation, goal=goal, replies=REPLIES)
         return self.impose(value + evaluate(evaluation, self.equation(value, policy), self.grid))

@@ -157,7 +157,7 @@ class Seen:
     Args:
       fastest: the largest Q + β under the chosen actions, per unit time.
       lacking: the flat index of the first node where noise is correlated more than the spacings allow, or −1.
-      t: the time of that.
+      t: the time at which this noise was found.
       cut: the number of nodes at each end of the box where drift is cut off, (n, 2).
     """
 
@@ -191,8 +191,7 @@ def _largest_decay(on: Discretisation) -> Scalar:
 def terminal(on: Discretisation, start: Nodes | None = None) -> Field:
     """V at the horizon, the time of ``on``: ``start`` or the terminal cost, with fixed values and constraints imposed.
 
-    Without either, a stopping cost is paid at the latest then, and a running maximum is g itself; else the value is
-    zero.
+    Without either, V is the stopping cost, which must be paid at the horizon, or the running maximum g, or else zero.
     """
     obstacles, problem = bellman.obstacles(on), on.problem
     if start is not None:  # the user's start need not satisfy the constraints
@@ -255,7 +254,7 @@ def _advance(march: March, front: Front, until: Number) -> Front:
     else:
         dt, t, left = _moved(front, until, count)
         value, ok, seen = march.method.step(march, front.value, front.t, t, dt)
-    # finite only if all values are: ∞ − ∞ is NaN
+    # high − low is finite only if all values are finite, because ∞ − ∞ is NaN
     low, high = march.layout.least(value), march.layout.largest(value)
     # later faults override earlier ones
     code = jnp.where(ok, Status.RUNNING, Status.STALLED)
@@ -315,7 +314,7 @@ def _short_enough(
     endless = dataclasses.replace(nothing, fastest=jnp.full_like(nothing.fastest, jnp.inf))
     start = (count, jnp.zeros((), jnp.int32), front.value, endless)
     carry = jax.lax.while_loop(too_long, attempt, start)
-    # with tries reset: true if the last attempt was short enough, false if the attempts ran out
+    # tries = 0 here: true if the last attempt was short enough, false if the attempts ran out
     return carry[2], _moved(front, until, carry[0])[1:], ~too_long((carry[0], 0, *carry[2:])), carry[3]
 
 

@@ -103,10 +103,10 @@ def stationary_density(
     """The stationary density of the chain under a policy: 𝓛*p = 0, with integral one.
 
     It is the stationary probability of each node divided by the volume of its cell, and scaled so that
-    ``np.sum(density * grid.volumes())`` is one. The cell is half a cell at a wall on which noise reflects. It is a
-    whole cell at an end of an axis without noise, where drift enters and leaves at the rate |f|/h, as inside the box.
-    The density is second order, also at walls, where central differences are monotone, and first order elsewhere. It is
-    computed by a sparse LU factorisation, see ``stationary_law``. Arguments as for ``generator``.
+    ``np.sum(density * grid.volumes())`` is one. The cell of a node on a wall that reflects noise is half
+    as wide. At an end of an axis without noise it is a whole cell, where drift enters and leaves at the rate |f|/h, as
+    inside the box. The density is second order, also at walls, where central differences are monotone, and first order
+    elsewhere. It is computed by a sparse LU factorisation, see ``stationary_law``. Arguments as for ``generator``.
 
     Returns:
       The density at the nodes, shape (*grid), in 1/(units of the states); zero at transient nodes.
@@ -162,8 +162,8 @@ def transition_arrays(
     QuantEcon maximises. ``DiscreteDP(rewards, probabilities, factor, state_index, action_index)`` has the value V_h of
     a problem with rewards, and with ``-costs`` it has the value −V_h of a problem with costs.
 
-    A discount that is a function β(x) of the state counts time by dτ = β(x) dt, in which the discount is one: drift,
-    noise and costs are divided by β, so that one factor serves all states.
+    If the discount is a function β(x) of the state, the arrays use the time τ with dτ = β(x) dt, in which the discount
+    is one. Drift and costs are divided by β and the noise by √β, so that all states have the same factor.
 
     Args:
       problem: discounted, without disturbances or constraints, with K ``Finite`` controls, or None (K = 1).

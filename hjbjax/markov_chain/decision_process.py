@@ -148,7 +148,8 @@ def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> 
     for axis, link in enumerate(links):
         for step, meets in ((1, link.meets_up), (-1, link.meets_down)):
             if meets is not None:
-                # the table pays the exit cost of the node behind the boundary, a cut link that at the crossing
+                # the table pays the exit cost of the node behind the boundary, a cut link pays the exit cost at the
+                # crossing
                 offset = stencil.unit(grid, axis, step)
                 beyond = np.asarray(stencil.neighbour(jax.numpy.asarray(given), grid, offset))
                 crosses, there = (np.asarray(entry) for entry in meets)

@@ -1,12 +1,13 @@
 """Recurrent classes of a Markov chain and their stationary distributions.
 
-A recurrent class is a set of states that lead to one another and nowhere else. A finite chain has at least one, and a
-unique stationary law μ exactly if it has only one. On that class, with μ_k = 1 at one state k, the other entries solve
+A recurrent class is a set of states that lead to one another and nowhere else. A finite chain has at least one. Its
+stationary law μ is unique if and only if it has only one recurrent class. On that class, with μ_k = 1 at one state k,
+the other entries solve
 
     (−𝓛*) μ = (rates from k)        without the row and the column k,
 
 an M-matrix that is diagonally dominant by columns, so elimination along the diagonal is stable and free of
-cancellation. Rounding changes μ by at most eps (−𝓛*)⁻¹ |𝓛*| μ, entry by entry to first order, which one more solve
+cancellation. Rounding changes each entry of μ, to first order, by at most eps (−𝓛*)⁻¹ |𝓛*| μ, which one more solve
 evaluates. If this is large, the class is connected by rates hardly larger than rounding, and numerically there are
 several classes. The cost is one or two sparse LU factorisations, as for a stationary solve on the same grid.
 """

@@ -57,7 +57,7 @@ def costates(
         ax.plot(times, costates[:, i], color=colours[i], linewidth=1.4, label=f"λ, {names[i]}")[0] for i in range(count)
     ]
     if solution is not None:
-        # time is the first argument of a marched V; the angles of an extremal are unwound, those of the grid are not
+        # a marched V takes the time first; the angles of an extremal are unwound and must be wrapped into the grid
         where = (times,) * (solution.times is not None) + (np.asarray(solution.grid.wrap(extremal.states)),)
         with warnings.catch_warnings(action="ignore"):  # outside the grid DV is NaN, which interrupts the line
             slopes = np.ma.masked_invalid(solution.costate_at(*where))

@@ -1,7 +1,8 @@
 """Zero level sets of values in two and three dimensions, as slices or projections, and animations.
 
-A set {V ≤ 0} in more states than are drawn is cut by ``fixed`` or projected. A point belongs to the projection if some
-state above it belongs to the set, so the value is minimised over the removed axes (maximised for {V ≥ 0}).
+If a set {V ≤ 0} has more states than the picture, it is cut at the values in ``fixed``, or projected. A point belongs
+to the projection if some state above it belongs to the set. The value is therefore minimised over the removed axes, or
+maximised for {V ≥ 0}.
 """
 
 from __future__ import annotations

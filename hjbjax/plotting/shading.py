@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
 
-FLAT = 1e-4  # relative variation below which a field is drawn as constant; a solve leaves this much of a constant
+FLAT = 1e-4  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
 HATCH, STROKE = "////", "#909090"
 EXTREME = 1e-6  # fraction of the range: a control closer to its end counts as being there
 JUMPING = 0.9  # fraction of nodes at an end of the range, or at zero, that identifies a feedback that jumps

@@ -1,6 +1,6 @@
 """Prescribed ends of the box: the value, the slope or the growth rate of V there.
 
-A ``Grid`` takes them in ``edges``, for one end at a time. Each is a number or a function of the state, which is
+Pass one per end in ``Grid(edges=...)``. Each is a number or a function of the state, which is
 evaluated at the nodes of that end when the grid is made. Values and slopes have the sign of V, a cost or a reward.
 Slopes and rates are derivatives along the coordinate, not along the outward normal: if V increases, the slope is
 positive at both ends.

@@ -2,8 +2,8 @@
 
 Node-centred: both ends of an ordinary axis are nodes; a periodic axis omits its upper end. Coordinates are
 x_i = (lo·(M − i) + hi·i)/M with M = N − 1 (M = N on a periodic axis), so that a node at zero is exactly zero. NumPy
-computes them once, as one table per axis that is stored with the grid. A compiled division rounds differently, and a
-node on the boundary of a target must be inside or outside it in all programs alike.
+computes them once, as one table per axis that is stored with the grid. A compiled division rounds differently, but all
+programs must agree whether a node on the boundary of a target is inside.
 """
 
 import dataclasses
@@ -223,8 +223,8 @@ class Grid:
         total = np.ones(())
         for axis, count in enumerate(self.shape):
             gaps = np.diff(np.append(np.asarray(self.axis(axis)), self.hi[axis] if self.periodic[axis] else []))
-            # Each gap gives half to the node on either side. A periodic axis has one gap per node, so the two slices
-            # are the same, which is right because it is uniform.
+            # Each gap gives half to the node on either side. A periodic axis has one gap per node, and both slices are
+            # the whole axis. This is correct because its gaps are equal.
             share = np.zeros(count)
             share[: len(gaps)] += gaps / 2
             share[-len(gaps) :] += gaps / 2

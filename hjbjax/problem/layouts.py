@@ -4,7 +4,7 @@ A layout exchanges values between parts and reduces over all nodes. Parts are a 
 ``jax.shard_map``: every device runs the single-device program on its part of the grid. It fetches the nodes just beyond
 its part from the neighbouring parts by ``ppermute`` and reduces by ``pmax`` or ``psum``. The i-th axis of the mesh
 divides the i-th axis of the grid. With N nodes, part k of p has the nodes from ⌊kN/p⌋ up to ⌊(k + 1)N/p⌋, so that parts
-differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node less has a filler as its last
+differ by at most one node. Arrays have ⌈N/p⌉ entries per part. A part with one node fewer has a filler as its last
 entry, a copy of the next node. No node reads the value computed at a filler, and reductions ignore fillers.
 """
 
@@ -59,12 +59,12 @@ class Layout:
         return self.whole[axis] % self.sizes[axis] == 0
 
     def count(self, axis: int) -> int | Scalar:
-        """The number of nodes of this part along an axis; a known number if all parts have the same number."""
+        """The number of nodes of this part along an axis; an int if all parts have the same number."""
         return self.whole[axis]
 
     def last(self, axis: int, step: int) -> Array:
         """The entries that hold the last node of an axis in the direction of ``step``, bool."""
-        # NumPy, so that it is a small constant
+        # NumPy, so that the program contains it as a small constant
         return np.arange(self.whole[axis]) == (self.whole[axis] - 1 if step > 0 else 0)
 
     def own(self, table: Any, axis: int) -> Any:
@@ -96,14 +96,14 @@ class Layout:
         return jnp.sum(values)
 
     def some(self, mask: Mask) -> Verdict:
-        """True if a mask holds at some node."""
+        """True if a mask is true at any node."""
         return jnp.any(mask)
 
     def first(self, mask: Mask) -> Scalar:
         """The smallest index in C order of the nodes of a mask, (*grid); −1 for an empty mask."""
         return jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32)
 
-    # On the host: arrays of the whole grid and arrays of all parts.
+    # On the host: conversion between arrays of the whole grid and arrays of all parts.
 
     @property
     def entries(self) -> tuple[int, ...]:
@@ -136,7 +136,7 @@ class Layout:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Parts(Layout):
-    """The nodes of a grid over the devices of a mesh. Traced methods work only inside ``shard_map``.
+    """The nodes of a grid, divided over the devices of a mesh. The traced methods work only inside ``shard_map``.
 
     Args:
       whole: the number of nodes of the whole grid along every axis.
@@ -159,7 +159,7 @@ class Parts(Layout):
 
     @property
     def fits(self) -> bool:
-        """True if no part has fewer nodes than a stencil reads."""
+        """True if every part has at least ``FEWEST`` nodes along each divided axis, as stencils require."""
         return all(self.whole[axis] // self.sizes[axis] >= FEWEST for axis in self.axes)
 
     def _starts(self, axis: int) -> np.ndarray:
@@ -191,7 +191,7 @@ class Parts(Layout):
             for axis in self.axes if divided else ():
                 if not self.even(axis):
                     host = np.take(host, self._nodes_of_entries(axis), axis)
-            # each process makes the values of its own devices; a copy, because states are donated
+            # each process provides the values for its own devices; they are copied, because states are donated
             return jax.make_array_from_callback(
                 host.shape, self._sharding(divided), lambda index: np.array(host[index])
             )
@@ -202,7 +202,7 @@ class Parts(Layout):
         """The inverse of ``spread``: NumPy arrays of the whole grid."""
 
         def take(leaf: Any, divided: bool) -> np.ndarray:
-            # values of other processes must be requested by all processes
+            # an array held by several processes can be gathered only if all of them take part
             far = isinstance(leaf, jax.Array) and divided and not leaf.is_fully_addressable
             host = np.asarray(multihost_utils.process_allgather(leaf, tiled=True) if far else leaf)
             for axis in self.axes if divided else ():
@@ -215,7 +215,7 @@ class Parts(Layout):
     def mapped(self, function: Callable, over_nodes: Any, result_over_nodes: Any) -> Callable:
         """A function that runs on every device at once, each with its own part of arrays from ``spread``."""
         specs = (jax.tree.map(self._spec, marks) for marks in (over_nodes, result_over_nodes))
-        # values that are the same on every device come from reductions over all devices
+        # check_vma cannot see that results of reductions over all devices are the same on every device
         return jax.shard_map(function, mesh=self.mesh, in_specs=next(specs), out_specs=next(specs), check_vma=False)
 
     def _spec(self, divided: bool) -> PartitionSpec:
@@ -225,14 +225,14 @@ class Parts(Layout):
     def _sharding(self, divided: bool) -> NamedSharding:
         return NamedSharding(self.mesh, self._spec(divided))
 
-    # Inside ``shard_map``: this part.
+    # Inside ``shard_map``, on this device's part.
 
     def index(self, axis: int) -> Scalar:
         """The number of this part along a divided axis."""
         return jax.lax.axis_index(self.names[axis])
 
     def count(self, axis: int) -> int | Scalar:
-        """The number of nodes of this part along an axis; a known number if all parts have the same number."""
+        """The number of nodes of this part along an axis; an int if all parts have the same number."""
         if self.even(axis):
             return self.shape[axis]
         return jnp.asarray(np.diff(self._starts(axis)), jnp.int32)[self.index(axis)]
@@ -266,7 +266,7 @@ class Parts(Layout):
         return jax.lax.ppermute(values, self.names[axis], pairs)
 
     def _real(self) -> jax.Array | None:
-        """True at entries that are nodes, False at fillers; broadcasts. None if there are no fillers."""
+        """True at nodes, False at fillers, in a shape that broadcasts to a part; None if there are no fillers."""
         found = None
         for axis in self.axes:
             if not self.even(axis):
@@ -281,7 +281,7 @@ class Parts(Layout):
         return values if real is None else jnp.where(real, values, jnp.zeros((), values.dtype))
 
     def _reduced(self, values: AtNodes | Mask, within: Callable, across: Callable, neutral: Any) -> jax.Array:
-        """A reduction over all nodes: ``within`` each part, then ``across`` parts; fillers are neutral."""
+        """A reduction over all nodes: ``within`` each part, then ``across`` the parts; fillers count as ``neutral``."""
         real = self._real()
         if real is not None:
             values = jnp.where(real, values, jnp.asarray(neutral, jnp.result_type(values)))
@@ -300,7 +300,7 @@ class Parts(Layout):
         return self._reduced(values, jnp.sum, jax.lax.psum, 0)
 
     def some(self, mask: Mask) -> jax.Array:
-        """True if a mask holds at some node."""
+        """True if a mask is true at any node."""
         return self._reduced(mask, lambda found: jnp.any(found).astype(jnp.int32), jax.lax.pmax, False) > 0
 
     def first(self, mask: Mask) -> jax.Array:
@@ -317,7 +317,7 @@ class Parts(Layout):
 
 @dataclasses.dataclass(frozen=True)
 class Lanes:
-    """Lanes of a batch over all devices of a mesh, the same number on each: the leading axis of every array.
+    """The lanes of a batch, the leading axis of every array, divided evenly over all devices of a mesh.
 
     Args:
       mesh: the devices; None for a single device.
@@ -327,18 +327,18 @@ class Lanes:
 
     @property
     def spec(self) -> PartitionSpec:
-        """The layout of an array on the mesh: its lanes along all axes together."""
+        """The layout of an array on the mesh: its leading axis is divided over all axes of the mesh together."""
         return PartitionSpec(() if self.mesh is None else self.mesh.axis_names)
 
     @property
     def on_processors(self) -> bool:
-        """True if the devices are CPU cores, each of which one lane keeps busy."""
+        """True if the devices are CPUs, where a single lane keeps each device busy."""
         return self.mesh is not None and self.mesh.devices.flat[0].platform == "cpu"
 
     @staticmethod
     def in_turn(function: Callable) -> Callable:
-        """A function of one lane applied to lanes one after the other, each with its own number of iterations."""
-        # 48 pendulums on 100 x 101 nodes take as long as in threads; vmap takes 1.3 to 1.8 times as long
+        """Apply a function of one lane to the lanes one after the other, each with its own number of iterations."""
+        # 48 pendulums on 100 x 101 nodes take as long as in separate threads; vmap takes 1.3 to 1.8 times as long
         return lambda *rows: jax.lax.map(lambda row: function(*row), rows)
 
     def filled(self, count: int) -> int:
@@ -347,7 +347,7 @@ class Lanes:
         return -(-count // size) * size
 
     def spread(self, tree: T) -> T:
-        """Arrays of lanes, each on the device that runs it."""
+        """Place the lanes of all arrays on the devices that run them."""
         if self.mesh is None:
             return tree
         sharding = NamedSharding(self.mesh, self.spec)
@@ -376,8 +376,8 @@ def spans_processes(mesh: Mesh | None) -> bool:
 
 
 def _largest(value: Scalar, names: tuple[str, ...]) -> Scalar:
-    """The largest of one number per part; NaN if one of them is NaN, for any backend's order of comparisons."""
+    """The largest of one number per part; NaN if one of them is NaN, whether or not the backend's maximum keeps NaN."""
     lost = jnp.isnan(value)
-    # one exchange for both: a maximum that drops a NaN would count as converged
+    # one exchange for the maximum and the NaN; with the NaN dropped, the solve would appear to converge
     found = jax.lax.pmax(jnp.stack([jnp.where(lost, -jnp.inf, value), lost.astype(value.dtype)]), names)
     return jnp.where(found[1] > 0, jnp.nan, found[0])

@@ -108,7 +108,7 @@ class Problem:
     stopping_reward: Any = None
     discounted: bool | None = dataclasses.field(init=False, default=None, repr=False)
     payoff: str = dataclasses.field(init=False, default=COST, repr=False)
-    # the part of the discount that is a function of the state, in the problem of a march; the other part is a number
+    # the part of the discount that is a function of the state, in the problem of a march; the other part is constant
     killing: Any = dataclasses.field(init=False, default=None, repr=False)
 
     def __init__(

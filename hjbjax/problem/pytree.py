@@ -50,7 +50,7 @@ ELSEWHERE = {  # names of arguments in other packages and books, and the names u
 }
 # the start of an error message of a function that other public functions call
 INNER = re.compile(r"^(lane \d+: )?(?:solve|solve_batch|march|reach_probability): ")
-INTERRUPT = re.compile(r"\nKeyboardInterrupt\b.*\s*\Z")  # the end of the traceback that XLA makes an error of its own
+INTERRUPT = re.compile(r"\nKeyboardInterrupt\b.*\s*\Z")  # end of a traceback in the text of an XLA error
 REMEMBERED = 256  # the number of most recent answers to keep per function; their keys hold functions and arrays
 
 
@@ -125,7 +125,7 @@ def front_door(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function: sets the package's JAX options and adds ``with_suggestions``.
 
     If ``solve`` or ``march`` raises inside the function, the message begins with the name of the outer function. Ctrl-C
-    is a ``KeyboardInterrupt`` also if it fell into a call of the host from a compiled program, as under ``grad``.
+    is a ``KeyboardInterrupt`` even if it came while a compiled program called the host, as under ``grad``.
     """
 
     @functools.wraps(function)
@@ -231,7 +231,7 @@ def as_one_program(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a function of pytrees with tracers: one compiled program, and one more for its derivative.
 
     ``grad`` and ``vmap`` without ``jit`` compile and run operation by operation. Here only the tracers are arguments of
-    the program. Known numbers, including those in the result, are constants of the program.
+    the program. Known numbers, including known numbers in the result, are constants of the program.
     """
 
     @jax.jit

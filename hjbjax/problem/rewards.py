@@ -1,8 +1,8 @@
 """Problems with rewards as problems with costs: max ∫ e^{−βt} r dt = −min ∫ e^{−βt} (−r) dt.
 
-The solvers minimise and do not distinguish the two. A public function that takes a problem with rewards replaces the
-rewards by costs, minus the rewards, before anything else, and gives its results the sign of the rewards at the end; see
-``solution.rewards``. The costs keep the numbers of the rewards as leaves.
+The solvers only minimise costs. A public function that accepts rewards first replaces them by costs, which are minus
+the rewards. At the end it gives its results the sign of the rewards, see ``solution.rewards``. The numbers in the
+rewards are leaves of the costs.
 """
 
 import dataclasses
@@ -49,10 +49,10 @@ def negative(payment: Any) -> Any:
 def _negative_function(function: Callable) -> Callable:
     """Minus a function.
 
-    It is a closure, not an object, so that the numbers that the function reads from outside are found.
+    It is a closure, not an object, because the search for numbers that a function reads from outside follows closures.
     """
 
-    # ``__wrapped__`` is the signature that messages show; an object without a name is called reward
+    # messages show the signature of ``__wrapped__``; an object without a name is shown as ``reward``
     @functools.wraps(function, assigned=("__name__",), updated=())
     def reward(*arguments: Any, **options: Any) -> Any:
         return _negative_number(function(*arguments, **options))
@@ -61,17 +61,17 @@ def _negative_function(function: Callable) -> Callable:
 
 
 def _negative_number(number: Any) -> Any:
-    """Minus real numbers; anything else is returned unchanged, to be refused by the checks in the user's words."""
+    """Minus real numbers; anything else is returned unchanged, so that the checks can quote what the user wrote."""
     if isinstance(number, (bool, str)) or not isinstance(number, (int, float, np.ndarray, np.number, jax.Array)):
         return number
     kind = jnp.result_type(number)
     if jnp.issubdtype(kind, jnp.unsignedinteger) or not jnp.issubdtype(kind, jnp.number):
         return number
-    return 0 - number  # not −number: minus zero is zero
+    return 0 - number  # not −number, which would turn 0.0 into −0.0
 
 
 def negative_ends(grid: Grid) -> Grid:
-    """The grid with minus the values and slopes that are prescribed at its ends; a growth rate has no sign."""
+    """The grid with the opposite sign of the values and slopes prescribed at its ends; growth rates do not change."""
 
     def changed(end: Any) -> Any:
         names = [each.name for each in dataclasses.fields(end) if each.name != "rate"]
@@ -81,7 +81,7 @@ def negative_ends(grid: Grid) -> Grid:
 
 
 def refuse_rewards(problem: Problem | None, name: str, why: str) -> None:
-    """Refuse a problem with rewards on behalf of a function that is about costs, with the reason.
+    """Refuse a problem with rewards in a function that only supports costs, with the reason ``why``.
 
     Raises:
       ValueError: the problem has rewards.

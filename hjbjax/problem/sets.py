@@ -140,7 +140,7 @@ class Finite:
 
 @pytree_dataclass(static=("dim",))
 class AnyControl:
-    """All of R^dim, for questions under a given control, in which no admissible set matters.
+    """All of R^dim, to evaluate a problem at a given control, where the admissible set does not matter.
 
     Args:
       dim: the number of inputs m.

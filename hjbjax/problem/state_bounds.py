@@ -2,9 +2,9 @@
 
     u = ½ (1 − v) lo(x) + ½ (1 + v) hi(x),    −1 ≤ v ≤ 1 for every input.
 
-The map is affine in v, so drift and cost depend on v as they depend on u: affinely, quadratically, or otherwise. A
-minimum that is exact over a fixed box is therefore exact over the bounds at every node, and v = ±1 gives the bounds to
-the last bit. The solvers only know fixed sets.
+The map is affine in v, so a drift or cost that is affine or quadratic in u is affine or quadratic in v. If the minimum
+is exact over a fixed box, it is therefore also exact over the bounds at every node. v = ±1 gives the bounds to the last
+bit. The solvers only need to support fixed boxes.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from hjbjax.problem.types import Array, Control
 
 
 def count_of(problem: Problem, n: int) -> int:
-    """The number of inputs of a problem with ``n`` states whose controls are a function of the state.
+    """The number of inputs of a problem with ``n`` states whose ``controls`` are a function of the state.
 
     Raises:
       ValueError: the function does not return a ``Box``, or cannot be traced.
@@ -51,13 +51,13 @@ def bounds_at(controls: Callable, *where: Any) -> tuple[Array, Array]:
 
 
 def control_of(bounds: tuple[Array, Array], v: Array) -> Control:
-    """u for v between −1 and 1."""
+    """The control u that belongs to v, each component of v from −1 to 1."""
     lo, hi = bounds
     return ((1 - v) * lo + (1 + v) * hi) / 2
 
 
 def in_unit_box(problem: Problem, n: int) -> Problem:
-    """The problem with v as its control; unchanged if its set does not depend on the state.
+    """The problem with v as its control; unchanged if its bounds do not depend on the state.
 
     Example:
       >>> problem = Problem(lambda x, u: u, lambda x, u: u[0], lambda x: Box(-x, 3 * x), discount=1.0)
@@ -74,18 +74,18 @@ def in_unit_box(problem: Problem, n: int) -> Problem:
 
 
 def with_any_control(problem: Problem, n: int) -> Problem:
-    """The problem without bounds, for questions under a given control; unchanged if its set is fixed."""
+    """The problem without bounds, to evaluate its functions at a given control; unchanged if its set is fixed."""
     return altered(problem, controls=AnyControl(count_of(problem, n))) if callable(problem.controls) else problem
 
 
 def _of_v(function: jax.tree_util.Partial, problem: Problem) -> jax.tree_util.Partial:
-    """A function of (x, u) as a function of (x, v), with the leaves of both.
+    """A function of (x, u) as a function of (x, v), with the leaves of the function and of the bounds.
 
-    It is a closure, not an object, so that the numbers that the functions read from outside are found.
+    It is a closure, not an object, because the search for numbers that a function reads from outside follows closures.
     """
     above: Callable = function.func
     below: Callable = problem.controls.func
-    place = int(problem.time_dependent)  # of the state among the arguments
+    place = int(problem.time_dependent)  # position of the state among the arguments
 
     def steered(mine: tuple, theirs: tuple, *arguments: Any) -> Array:
         (known, options), (numbers, others) = mine, theirs

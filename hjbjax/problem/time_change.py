@@ -1,13 +1,13 @@
 """Discounts that are functions of the state, for problems without a horizon.
 
-A path that is discounted at the rate β(x) counts as much as a path in the time τ with dτ = β(x) dt that is discounted
-at the rate one. The equation divided by β(x),
+Discounting at the rate β(x) in the time t is discounting at the rate one in the time τ with dτ = β(x) dt. The equation
+divided by β(x),
 
     V = min_u max_d [ L/β + (f/β)·DV + ½ tr((σ/√β)(σ/√β)ᵀ D²V) ],
 
-has the same solution, and so has its Markov chain: jump rates are linear in f and σσᵀ, so every row of the chain is
-divided by one number. The residual is then r/β, and the additive certificate V + min r/β ≤ V_h ≤ V + max r/β holds with
-the β of each node. The solvers therefore only know discounts that are numbers.
+has the same solution. The same holds for its Markov chain: jump rates are linear in f and σσᵀ, so each row of the chain
+is divided by β at its node. The residual becomes r/β, and the additive certificate is V + min r/β ≤ V_h ≤ V + max r/β
+with the β of each node. The solvers therefore only need to support constant discounts.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from hjbjax.problem.types import Array, State
 
 
 def in_own_time(problem: Problem) -> Problem:
-    """The problem with discount one in the time τ, dτ = β(x) dt; unchanged if its discount is a number.
+    """The problem in the time τ, dτ = β(x) dt, with discount one; unchanged if its discount is a constant.
 
     Where β(x) ≤ 0 the functions of the new problem are NaN.
 
@@ -46,9 +46,10 @@ def in_own_time(problem: Problem) -> Problem:
 
 
 def with_killing(problem: Problem) -> Problem:
-    """The problem whose discount is a function of the state as a killing, for a march; unchanged if it is a number.
+    """The problem of a march, with β(x) as the killing and discount zero; unchanged if its discount is a constant.
 
-    A horizon cannot be reached in the time τ. The killing is the part of β V that is not a number times V.
+    The time τ cannot be used here, because paths reach the horizon at different τ. The equation of a march has the term
+    (discount + killing) V, where the killing depends on the state.
     """
     if not callable(problem.discount):
         return problem
@@ -56,14 +57,14 @@ def with_killing(problem: Problem) -> Problem:
 
 
 def _constant(value: Array, *arguments: Array) -> Array:
-    """A number as a function."""
+    """A constant as a function."""
     return value
 
 
 def _over(function: jax.tree_util.Partial, discount: jax.tree_util.Partial, root: int) -> jax.tree_util.Partial:
-    """A function of (x, u) or (x, u, d) over the root of β(x), with the leaves of both.
+    """A function of (x, u) or (x, u, d) divided by the ``root``-th root of β(x), with the leaves of both functions.
 
-    It is a closure, not an object, so that the numbers that the functions read from outside are found.
+    It is a closure, not an object, because the search for numbers that a function reads from outside follows closures.
     """
     above: Callable = function.func
     below: Callable = discount.func
@@ -71,7 +72,7 @@ def _over(function: jax.tree_util.Partial, discount: jax.tree_util.Partial, root
     def scaled(mine: tuple, theirs: tuple, x: State, *actions: Any) -> Array:
         (known, options), (numbers, others) = mine, theirs
         rate = jnp.asarray(below(*numbers, x, **others))
-        rate = jnp.where(rate > 0, rate, jnp.nan)  # a negative rate would turn the time around
+        rate = jnp.where(rate > 0, rate, jnp.nan)  # a negative rate would reverse the time
         return jnp.asarray(above(*known, x, *actions, **options)) / (rate if root == 1 else jnp.sqrt(rate))
 
     leaves = (function.args, function.keywords), (discount.args, discount.keywords)

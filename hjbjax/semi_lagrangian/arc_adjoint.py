@@ -4,9 +4,9 @@ The value V of a converged solve satisfies, at every free node,
 
     Φ(V, θ) = pay(θ) + keep(θ) I[V](y(θ)) − V = 0
 
-for the best arc of the node, with fixed action and length. Let W be the weights of that arc. Then ∂Φ/∂V = −(I − W), so
-dV = (I − W)⁻¹ ∂Φ/∂θ dθ: one linear solve in forward mode and one transposed solve in reverse mode. Sequences of best
-arcs always reach the target, so the solve can follow them repeatedly.
+for the best arc of the node, with fixed action and length. Let row x of W contain the weights ``keep`` · I of the best
+arc of node x. Then ∂Φ/∂V = −(I − W), so dV = (I − W)⁻¹ ∂Φ/∂θ dθ: one linear solve in forward mode and one transposed
+solve in reverse mode. The iteration δ ← right + W δ converges, because the best arcs lead to the target or discount V.
 """
 
 import functools
@@ -83,7 +83,7 @@ def _attach_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
         return delta - weighted(delta)
 
     right = jax.jvp(lambda question: question.residual(value), (equation,), (tangents[1],))[1]
-    # value and operator are constants here; a second derivative would require theirs
+    # value and operator are constants here; a second derivative would require their derivatives
     right = right + once(equation, "a solve").astype(right.dtype)
     return value, jax.lax.custom_linear_solve(operator, right, _solve, _solve)
 

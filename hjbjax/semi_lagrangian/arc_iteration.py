@@ -4,13 +4,14 @@ For every arc Q = pay + keep · I[V] (see ``arcs``). With the residual r = min Q
 
     residual = min(r, ψ − V);    V − max (V − Q)⁺/(1 − κ) ≤ V_h ≤ V + max r/(1 − κ),
 
-where the lower bound uses all arcs of all nodes, and the upper bound the best arc where r > 0: V + ε is a supersolution
-if one arc of every node has Q + κ ε ≤ V + ε, and V − ε a subsolution if all arcs have Q − κ ε ≥ V − ε. Without a
-discount the running cost c > 0 of an arc replaces 1 − κ in V/(1 + η) ≤ V_h ≤ V/(1 − ρ), as in ``certificates``.
+where the lower bound uses all arcs of all nodes, and the upper bound uses the best arc of each node with r > 0. The
+reason is that V + ε is a supersolution if one arc of every node has Q + κ ε ≤ V + ε, and V − ε is a subsolution if all
+arcs have Q − κ ε ≥ V − ε. Without a discount the bounds are V/(1 + η) ≤ V_h ≤ V/(1 − ρ) as in ``certificates``, with
+the running cost c > 0 of an arc instead of 1 − κ.
 
 A step follows each node's best arc several times and then evaluates all arcs, which is modified policy iteration. Value
-iteration follows it once. Because an arc crosses several cells, information travels from the target to the ends of the
-box in one relaxation per arc of the path.
+iteration follows it once. An arc crosses several cells, so information travels from the target to the ends of the box
+in few relaxations, one per arc of the path.
 """
 
 import dataclasses
@@ -44,7 +45,7 @@ class ArcTask:
       counted: bool (*grid), the nodes with a finite value; no arc leads from them to other nodes.
       tol: the certified error to reach, cost units.
       certificate: additive or multiplicative.
-      relaxations: number of times the best arcs are followed between two evaluations of all arcs.
+      relaxations: the number of times that the best arcs are followed between two evaluations of all arcs.
     """
 
     grid: Grid
@@ -78,7 +79,7 @@ class ArcState:
 
 
 class _Look(NamedTuple):
-    """An evaluation of all arcs: the least Q, its number, and the excess of V over Q relative to the arc's cost."""
+    """An evaluation of all arcs: the least Q, the number of its arc, and the largest (V − Q)⁺/``_unit`` of an arc."""
 
     worth: Field
     number: AtNodes
@@ -95,10 +96,10 @@ def start(task: ArcTask, guess: Nodes) -> ArcState:
 def value_from_above(task: ArcTask) -> Field:
     """A value above the solution, from which relaxations descend, with the constraints imposed.
 
-    From below, every node would first take the shortest arc, which pays least, and V would rise by one cell per
-    relaxation. With a discount the start is a constant V with min Q ≤ V: the largest over the nodes of min pay/(1 −
-    keep). Without a discount there is no such constant; the start is the cost of one arc at the most
-    expensive node, times the sum of the nodes over the axes.
+    If V started below, every node would first choose the shortest arc, because it costs least, and the correct values
+    would spread by one cell per relaxation. With a discount the start is a constant V with min Q ≤ V: the maximum over
+    the nodes of min pay/(1 − keep). Without a discount there is no such constant. The start is then the cost of one arc
+    at the most expensive node, times the number of nodes summed over the axes.
     """
     arcs, free = task.arcs, task.counted & ~task.obstacles.fixed
     least = jnp.full(task.grid.shape, jnp.inf, arcs.pay.dtype)
@@ -140,12 +141,12 @@ def look(task: ArcTask, value: Field) -> _Look:
 def _unit(arcs: Arcs) -> jax.Array:
     """The divisor of r in the certificate: 1 − e^{−βτ}, or without a discount the running cost of an arc.
 
-    For an arc that ends on the target it is Q, including the exit cost unless this is negative, because next to a
-    target the running cost may be as small as the rounding error of V.
+    For an arc that ends on the target it is Q, which includes the exit cost (if that is not negative), because next to
+    a target the running cost may be as small as the rounding error of V.
     """
     if arcs.running is None:
         return 1 - arcs.keep
-    ends = (arcs.keep == 0) & jnp.isfinite(arcs.pay)  # infinite for an arc to an unreachable node
+    ends = (arcs.keep == 0) & jnp.isfinite(arcs.pay)  # ``pay`` is infinite for an arc to an unreachable node
     return jnp.where(ends, jnp.maximum(arcs.running, arcs.pay), arcs.running)
 
 
@@ -161,7 +162,7 @@ def _advance(task: ArcTask, state: ArcState, chunk: Scalar) -> ArcState:
 
 
 def _relaxed(task: ArcTask, state: ArcState) -> Field:
-    """V after following every node's best arc several times; a guess has no best arcs, and is only imposed."""
+    """V after following every node's best arc several times; for a guess, which has no best arcs, ``impose`` only."""
     arcs = task.arcs.chosen(state.number)
 
     def follow(_: Scalar, value: Field) -> Field:
@@ -176,7 +177,7 @@ def _bound(task: ArcTask, value: Field, found: _Look) -> ErrorBound:
     obstacles, free = task.obstacles, task.counted & ~task.obstacles.fixed
     left = jnp.where(free, found.worth - value, 0)
     best = task.arcs.chosen(found.number)
-    # like the defect of a chain whose discount, or running cost, is one
+    # scaled like the defect of a chain whose discount or running cost is one
     defect = jnp.where(left > 0, left / _unit(best), -found.decline)
     residual = left if obstacles.upper is None else jnp.where(free, jnp.minimum(left, obstacles.upper - value), 0)
     iterate = Iterate(
@@ -205,9 +206,10 @@ def _status_after(task: ArcTask, value: Field, bound: ErrorBound, since: Scalar)
 
 
 def arriving(arcs: Arcs, grid: Grid, held: Mask, inside: AtNodes | None = None) -> AtNodes:
-    """The nodes that some choice of arcs may bring to the target, without leaving ``inside``, bool (*grid).
+    """The nodes from which some choice of arcs may reach the target without leaving ``inside``, bool (*grid).
 
-    Such an arc ends in a cell whose corners are all inside, at least one of them nearer to the target.
+    The last arc ends on the target. Every other arc ends in a cell whose corners are all inside and one of which is
+    such a node.
     """
     zero = jnp.zeros(grid.shape, arcs.pay.dtype)
     outside = widened(zero if inside is None else zero + ~inside, grid)
@@ -247,7 +249,7 @@ def _until_still(step: Callable, pair: tuple[AtNodes, AtNodes]) -> AtNodes:
 
 
 def without(arcs: Arcs, grid: Grid, counted: Mask) -> Arcs:
-    """The arcs, with infinite cost for those that lead to nodes that do not count."""
+    """The arcs, with infinite cost for arcs to nodes that do not count."""
     lost = widened(jnp.where(counted, 0.0, 1.0).astype(arcs.pay.dtype), grid)
 
     def each(one: Arcs) -> tuple[jax.Array, jax.Array]:

@@ -8,9 +8,10 @@ where I[V] is the multilinear interpolant, whose weights are non-negative and su
 at a time τ' < τ, the arc ends there, and the exit cost, discounted by e^{−βτ'}, replaces V. The minimum of Q over arcs
 is a Bellman operator: monotone, and a contraction by the largest e^{−βτ}.
 
-A path consists of legs, each long enough to cross one cell at its initial speed, integrated by the classical
-fourth-order Runge–Kutta method. If the target's l changes sign on a leg, the time of the crossing is found by the
-secant and the position by Hermite's cubic. At an end of the box an outward component is cut off, like projected drift.
+A path consists of legs. Each leg takes the time to cross one cell at its initial speed (see ``SLOWEST``) and is one
+step of the classical fourth-order Runge–Kutta method. If the target's l changes sign on a leg, the secant gives the
+time of the crossing and Hermite's cubic the position. At an end of the box the outward component of a path is cut off,
+like projected drift.
 """
 
 from collections.abc import Sequence
@@ -28,14 +29,14 @@ from hjbjax.problem.stretching import into_period
 from hjbjax.problem.types import AtNodes, Mask, Number, Scalar
 from hjbjax.tracing import components
 
-# fraction of the greatest speed on the grid. Slower actions use this speed for the length of a leg, since near a rest
-# point crossing a cell would take arbitrarily long under one action.
+# fraction of the greatest speed on the grid. A slower leg takes as long as a leg at this speed, because near a rest
+# point crossing a cell could take arbitrarily long.
 SLOWEST = 0.1
 
 
 @pytree_dataclass()
 class Arcs:
-    """The K arcs from every node, as jumps of a chain; all entries (K, *grid), or (*grid) for one arc per node.
+    """The K arcs from every node, as jumps of a chain. All arrays are (K, *grid), or (*grid) for one arc per node.
 
     Args:
       pay: the discounted running cost along the arc, plus the exit cost if it ends on the target; cost units.
@@ -53,7 +54,7 @@ class Arcs:
 
     @property
     def count(self) -> int:
-        """K."""
+        """The number of arcs K."""
         return self.pay.shape[0]
 
     def one(self, k: Scalar) -> "Arcs":
@@ -82,7 +83,7 @@ class Arcs:
 
 
 def widened(value: AtNodes, grid: Grid) -> jax.Array:
-    """Node values, flat, with the first node of a periodic axis repeated at its end, so every cell has all corners."""
+    """Flat node values; the first node of a periodic axis is repeated at its end, so every cell has all corners."""
     for axis in range(grid.ndim):
         if grid.periodic[axis]:
             first = jax.lax.slice_in_dim(value, 0, 1, axis=axis)
@@ -91,9 +92,9 @@ def widened(value: AtNodes, grid: Grid) -> jax.Array:
 
 
 def trace(on: Discretisation, plan: Plan, held: Mask, *, running: bool) -> Arcs:
-    """The arcs of a plan from all nodes; arcs from ``held`` nodes, bool (*grid), cost nothing and stay.
+    """The arcs of a plan from all nodes. Arcs from ``held`` nodes, bool (*grid), cost nothing and do not move.
 
-    ``running``: store the running cost separately.
+    ``running``: True to store the running cost separately.
     """
     slowest = SLOWEST * _fastest(on, plan)
     start = [jnp.broadcast_to(x, on.grid.shape) for x in on.coordinates()]
@@ -120,7 +121,7 @@ def trace(on: Discretisation, plan: Plan, held: Mask, *, running: bool) -> Arcs:
 def trace_chosen(on: Discretisation, plan: Plan, number: AtNodes, held: Mask) -> Arcs:
     """The arc of a plan selected by ``number`` at each node; differentiable.
 
-    The legs are the same as in ``trace``, in a loop of fixed length, which reverse-mode derivatives require.
+    The legs are the same as in ``trace``, but in a loop of fixed length, as reverse-mode derivatives require.
     """
     count = len(plan.legs)
     u = [jnp.asarray(plan.actions)[number // count, j] for j in range(np.shape(plan.actions)[1])]
@@ -140,7 +141,7 @@ def trace_chosen(on: Discretisation, plan: Plan, number: AtNodes, held: Mask) ->
 
 
 class ArcPath(NamedTuple):
-    """Paths: position, time and discounted cost so far, l at the position, and a flag if ended."""
+    """Paths: position, time and discounted cost so far, l at the position, and True if the path has ended."""
 
     x: list[jax.Array]
     time: jax.Array
@@ -150,7 +151,7 @@ class ArcPath(NamedTuple):
 
 
 def _as_jumps(on: Discretisation, path: ArcPath, held: Mask, *, running: bool) -> Arcs:
-    """Complete paths, as jumps of the chain."""
+    """Convert complete paths to jumps of the chain."""
     grid, problem = on.grid, on.problem
     weight, pay = jnp.exp(-problem.discount * path.time), path.cost
     if problem.target is not None:
@@ -208,7 +209,7 @@ def leg(on: Discretisation, path: ArcPath, u: list[jax.Array], slowest: Scalar) 
 
 
 def _moved(grid: Grid, x: Sequence[jax.Array], f: Sequence[jax.Array], time: jax.Array) -> list[jax.Array]:
-    """x + time · f inside the box: cut off at its ends, wrapped on periodic axes."""
+    """x + time · f, clipped to the box, or wrapped on periodic axes."""
     found = []
     for axis, (place, velocity) in enumerate(zip(x, f, strict=True)):
         lo, hi = jnp.asarray(grid.lo[axis], place.dtype), jnp.asarray(grid.hi[axis], place.dtype)
@@ -245,6 +246,6 @@ def _fastest(on: Discretisation, plan: Plan) -> Scalar:
 
 
 def _strides(grid: Grid) -> list[int]:
-    """The distance between two neighbours in the array of ``widened``, for every axis."""
+    """The distance between two neighbours along every axis, in entries of the array of ``widened``."""
     counts = [count + bool(around) for count, around in zip(grid.shape, grid.periodic, strict=True)]
     return [int(np.prod(counts[axis + 1 :], dtype=np.int64)) for axis in range(grid.ndim)]

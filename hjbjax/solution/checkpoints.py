@@ -329,7 +329,7 @@ def refuse_checkpoint(checkpoint: object, resume: bool, caller: str) -> None:
     """Refuse a checkpoint inside a JAX transformation, which would leave the run without one.
 
     Raises:
-      ValueError: there is a checkpoint, or ``resume``.
+      ValueError: a checkpoint or ``resume`` was passed.
     """
     if checkpoint is not None or resume:
         raise ValueError(

@@ -31,7 +31,7 @@ CUT = (Status.INTERRUPTED, Status.TIME_LIMIT)
 class Stopped(Exception):
     """A run ends between two of its phases: ``status`` is the reason, ``reached`` the solution so far, if any.
 
-    Caught where there is a result to return.
+    It is caught by functions that have a result to return.
     """
 
     def __init__(self, status: Status, reached: Any = None):
@@ -84,7 +84,7 @@ class Clock:
         return _Beside(self)
 
     def beside_from_now(self) -> "Clock":
-        """``beside``, with all of the time limit for the run that begins now."""
+        """Like ``beside``, but the run that begins now gets the whole time limit."""
         lane = self.beside()
         lane.began = time.perf_counter()
         return lane

@@ -157,7 +157,8 @@ def nearest(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment |
     answer: Any = jnp.nan
     largest: Any = 0.0
     for weight, defined, there in _defined_corners(grid, values, x, clamp, when):
-        # A node is nearer in every axis exactly if its weight is larger; at the midpoint rounding must not decide.
+        # A node is nearer along every axis if and only if its weight is larger; at the midpoint rounding must not
+        # decide.
         nearer = defined & (weight > largest * (1 + 8 * jnp.finfo(x.dtype).eps))
         answer, largest = jnp.where(nearer[..., None], there, answer), jnp.where(nearer, weight, largest)
     return answer

@@ -1,8 +1,8 @@
-"""Solutions in the sign of the rewards.
+"""Conversion of solutions between costs and rewards.
 
 The solvers minimise costs. ``with_rewards`` makes a public function accept problems with rewards: it negates the guess
-on the way in, and value, bounds and prescribed ends on the way out. The labels of a solution say whether its value is
-a cost or a reward, so functions that use a value, such as ``simulate``, take it with ``in_costs``.
+and the prescribed ends on the way in, and the value and its bounds on the way out. The labels of a solution say whether
+its value is a cost or a reward. Functions that use a value, such as ``simulate``, convert it with ``in_costs``.
 """
 
 import inspect
@@ -22,8 +22,8 @@ from hjbjax.solution.solution import Solution, change_solutions
 
 P = ParamSpec("P")
 T = TypeVar("T")
-GUESSES = ("guess", "start")  # arguments of the solvers that are values
-WORDS = {  # a bound of a value ≤ 0 has its factors in the other order
+GUESSES = ("guess", "start")  # arguments of the solvers that hold a value V
+WORDS = {  # for V ≤ 0 the two factors change places
     "running cost, V/(1 + η) ≤ V_h ≤ V/(1 − ρ)": "running reward, V/(1 − ρ) ≤ V_h ≤ V/(1 + η)",
     "positive running cost": "negative running reward",
     "running cost": "running reward",
@@ -31,7 +31,7 @@ WORDS = {  # a bound of a value ≤ 0 has its factors in the other order
 
 
 def in_costs(solution: Solution) -> Solution:
-    """The solution whose value is a cost: minus the value and the bounds of a solution with rewards."""
+    """The solution with its value and bounds as costs, with the opposite sign if they were rewards."""
     if solution.labels.payoff == COST:
         return solution
     problem = None if solution.problem is None else costs_of(solution.problem)
@@ -39,7 +39,7 @@ def in_costs(solution: Solution) -> Solution:
 
 
 def in_rewards(solution: Solution, grid: Grid, problem: Problem | None = None) -> Solution:
-    """The solution whose value is a reward, on the user's grid, from a solver's solution."""
+    """A solver's solution with its value as a reward, on the user's grid."""
     if solution.labels.payoff == REWARD:
         return solution
     known = None if is_traced(problem) else problem
@@ -51,7 +51,7 @@ def in_rewards(solution: Solution, grid: Grid, problem: Problem | None = None) -
 
 
 def _negative(solution: Solution, payoff: str, grid: Grid, problem: Problem | None) -> Solution:
-    """The solution with minus its value, its bounds exchanged."""
+    """The solution with the opposite sign of its value, and with its bounds exchanged."""
     enclosure = solution.enclosure
     if enclosure is not None:  # −(factor · V + shift) = factor · (−V) − shift, and the bounds change places
         xp: Any = jnp if is_traced(enclosure) else np
@@ -68,14 +68,14 @@ def _negative(solution: Solution, payoff: str, grid: Grid, problem: Problem | No
 def with_rewards(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function of (problem or problems, grid, ...) that returns solutions of these problems.
 
-    Calls with costs only pass through unchanged.
+    Calls without rewards pass through unchanged.
     """
     first, second = list(inspect.signature(function).parameters)[:2]
 
     def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
         asked = given[first]
         if not isinstance(asked, Problem) and isinstance(asked, Iterable):
-            given[first] = asked = list(asked)  # only once, because it may be a generator
+            given[first] = asked = list(asked)  # read once, because it may be a generator
         problems = asked if isinstance(asked, list) else [asked]
         rewarded = [isinstance(each, Problem) and each.payoff == REWARD for each in problems]
         if not any(rewarded):
@@ -116,7 +116,7 @@ def _turn(error: BaseException, problems: list[Problem], rewarded: list[bool], g
 
 
 def _as_numbers(values: Any) -> Any:
-    """A guess as an array if it is one; anything else is left for the solver to refuse."""
+    """A guess as an array; anything that is not an array of numbers is left for the solver to refuse."""
     if values is None or is_traced(values):
         return values
     try:
@@ -127,7 +127,7 @@ def _as_numbers(values: Any) -> Any:
 
 
 def _refuse_mixed_ends(name: str, grid: Grid, *, all_rewarded: bool) -> None:
-    """Refuse prescribed values at the ends of the box that belong to costs and to rewards at the same time."""
+    """Refuse prescribed ends if some problems have costs and others rewards: their values would be both."""
     if not all_rewarded and grid.prescribed("dirichlet", "neumann", "robin"):
         raise ValueError(
             f"{name}: got problems with costs and problems with rewards on a grid with prescribed ends, whose numbers "

@@ -1,8 +1,8 @@
 """A test by simulation that the feedback of a solution reaches the target.
 
-Without a discount, and if continuing costs nothing, V does not distinguish a policy that reaches a reward from one that
-rests on the way: under the resting policy the chain still arrives eventually by numerical diffusion, and pays nothing
-until then, while a path of the system rests forever. Following a few paths shows the difference.
+Suppose that there is no discount and that continuing costs nothing. Then V does not distinguish a policy that reaches a
+reward from a policy that rests on the way: under the resting policy a path of the system never arrives, but the chain
+arrives eventually by numerical diffusion and pays nothing until then. Following a few paths shows the difference.
 """
 
 import functools

@@ -3,7 +3,7 @@
 Problems that differ only in numbers share their programs. On a CPU each lane is a separate solve, and one runs
 per core in parallel: JAX releases other threads while a program runs, and a solve keeps one core busy most of
 the time. Two cores gave 1.8 times the solves per second on 100 x 101 nodes. Lanes of one ``vmap``ped loop gave 0.9 to
-1.3, since sweeps are still a loop over slices, and every lane pays for the steps of the slowest.
+1.3 times, since sweeps are still a loop over slices, and every lane pays for the steps of the slowest lane.
 
 On an accelerator, which a single lane does not fill, they are lanes of one ``vmap``ped loop. It runs until its slowest
 lane stops, so finished lanes are removed between chunks.
@@ -92,7 +92,7 @@ def solve_batch(
     """Solve many problems on one grid; each solution is the same as from ``solve`` with this method.
 
     Args:
-      problems: problems; those with the same functions and shapes share a program, whatever their numbers.
+      problems: problems; problems with the same functions and shapes share a program, regardless of their numbers.
       grid: the grid.
       method: as in ``solve``, without nesting: ``Nested`` is replaced by its inner method; ``None`` chooses by the
         problem.

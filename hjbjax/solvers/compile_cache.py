@@ -24,7 +24,7 @@ def user_folder() -> Path:
 
 
 def keep_compiled(folder: str | os.PathLike | None = None) -> Path:
-    """Store compiled programs on disk, and reuse those that earlier processes stored.
+    """Store compiled programs on disk, and reuse programs that earlier processes stored.
 
     Call it once at the start of a script or notebook whose problems are solved again later. It sets options of JAX that
     hold for the whole process, so no solve sets them on its own. A program is reused if problem, shapes, options,

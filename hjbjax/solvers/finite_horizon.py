@@ -101,7 +101,8 @@ def march(
         of the horizon, and down to a 6400th where they change faster.
       inner: for a disturbance that is bounded only by the size of its ``Box``, as in an L₂ gain: the march stops with
         DIVERGED when the worst disturbance reaches that bound in this fraction of the grid's box about its middle,
-        which indicates that the value blows up. ``None`` is 0, never: the bound is part of the problem.
+        which indicates that the value blows up. ``None`` is 0: the bound is part of the problem and never stops the
+        march.
       policy: return the policy with the value; otherwise only V is stored, as in ``ValueIteration(policy=False)``.
       dtype: ``None`` is float64; ``"float32"`` for memory and accelerators.
       time_limit: seconds, including checks and compilation.
@@ -115,9 +116,9 @@ def march(
     Returns:
       The solution: ``value[i]`` is V(·, times[i]), shape (k, *grid), and similarly the policy. If the march stopped
       early, it contains the kept times that were reached, and the last time reached; after a time limit or Ctrl-C the
-      policy there may be missing, which is NaN. Inside ``jit``, ``vmap`` and ``grad`` the value is traced, and
-      ``horizon``, ``times`` and ``step`` must be known numbers. A step above the stability limit, or any other fault,
-      makes it and its derivatives NaN, unless ``throw=False``.
+      policy at that last time may be missing, that is, NaN. Inside ``jit``, ``vmap`` and ``grad`` the value is traced,
+      and ``horizon``, ``times`` and ``step`` must be known numbers. A step above the stability limit, or any other
+      fault, makes it and its derivatives NaN, unless ``throw=False``.
 
     Raises:
       ValueError: an argument is invalid, or the step is above the stability limit.
@@ -340,8 +341,8 @@ def _prepare(
     limit: Scalar = jnp.asarray(jnp.inf, dtype)
     method = method.filled(on, march_evaluation(problem, grid, divided=mesh is not None))
     if method.limited:
-        # For functions of time 1/(max Q + β) depends on time. A given step is checked against the least of many values;
-        # otherwise the step is computed before every step.
+        # If functions depend on time, so does the limit 1/(max Q + β). A step that the caller passes is checked against
+        # the limit at many times; otherwise the length is computed before every step.
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
             # the Euler steps inside a stage have length c Δt, and are monotone if c Δt (max Q + β) ≤ 1
@@ -358,8 +359,7 @@ def _prepare(
         time_probes.warn_of_fast_changes(found, horizon, step)
         longest, left = (found.lengths[:, None], found.left) if step is None else (step, 0.0)
     elif step is None and (looks[0] or not method.limited or problem.killing is not None):
-        # rates found during the march do not limit its first steps, and only a discount that is a number is integrated
-        # exactly
+        # rates found during the march do not limit its first steps, and only a constant discount is integrated exactly
         longest = horizon / FEWEST
     obstacles = None if moving or not policy else _obstacles(on)
     return March(

@@ -101,7 +101,7 @@ class Run(Part, Protocol):
         """The options of its progress bar."""
 
     def compile(self) -> None:
-        """Call the jitted passes without one."""
+        """Compile the jitted passes by a call that makes no pass."""
 
     def first_chunk(self, clock: Clock) -> int:
         """The number of passes of the first chunk, before any is timed."""
@@ -163,7 +163,7 @@ def drive(run: Run, clock: Clock) -> Status:
 
 
 def _status_interrupted(run: Run, clock: Clock, interrupt: KeyboardInterrupt) -> Status:
-    """The status of a run that Ctrl-C stopped at any moment.
+    """The status of a run that Ctrl-C stopped, which may happen at any moment.
 
     Raises:
       KeyboardInterrupt: it came between a step, which takes over the memory of the state, and the new state.

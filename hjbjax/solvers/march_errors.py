@@ -218,7 +218,7 @@ def _again(
 
 
 def _steps(task: March, longer: float) -> jax.Array:
-    """Steps longer by a factor; steps that were shortened for functions of time stay, to resolve these."""
+    """Steps longer by a factor, except steps that were shortened to resolve functions of time."""
     step = jnp.asarray(task.step)
     if step.ndim == 0:
         return longer * step

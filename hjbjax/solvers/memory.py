@@ -1,7 +1,7 @@
 """The memory that a solve needs before it starts, in Python integers, and the memory that is available.
 
-Available is the least of the free memory of the machine, of the limits of the process (``ulimit -v``) and of its
-control groups (such as a container's). The machine may report 60 GB free when a container is killed at 4.
+The available memory is the least of the free memory of the machine, the limits of the process (``ulimit -v``) and the
+limits of its control groups, such as a container. The machine may report 60 GB free when a container is killed at 4.
 """
 
 import contextlib

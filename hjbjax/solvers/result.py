@@ -265,7 +265,7 @@ def _lacking(task: Task, controls: tuple, disturbances: tuple) -> jax.Array:
 
 
 def _refuse_noise(task: Task, state: State, grid: Grid) -> None:
-    """Refuse noise of the found action that has no chain, although the samples checked before had one."""
+    """Refuse noise that no chain can represent under the optimal actions; the samples may not have included these."""
     if not callable(task.problem.noise) or not task.on.players.steers_noise:
         return
     policy = state.policy

@@ -325,7 +325,7 @@ def _leaving(on: Discretisation, value: np.ndarray, policy: np.ndarray, task: Ar
 
 @jax.jit
 def _arriving(task: ArcTask, number: jax.Array) -> jax.Array:
-    """The nodes that the best arcs bring to the target, and if some are missing, those that any arcs bring there."""
+    """The nodes from which the best arcs reach the target; if some are missing, the nodes from which any arcs do."""
     chosen = jax.tree.map(lambda entry: entry[None], task.arcs.chosen(number))
     found = arc_iteration.arriving(chosen, task.grid, task.obstacles.fixed)
     return jax.lax.cond(

@@ -70,8 +70,8 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
     Rest nodes are fixed first, at the cost of resting, and released where it pays to leave them. Their fixed value is
     an upper bound, from which the iteration only descends: a released node that was too low would stay too low, since
     resting costs nothing. If a game does not converge, the nodes from which its target can be forced are found, and the
-    game is solved there. Sweeps that stall, as where the drift circulates under a small discount, are replaced by a
-    linear solve.
+    game is solved there. Sweeps that stall, for example because the drift circulates under a small discount, are
+    replaced by a linear solve.
     """
     value = warm(task, guess, clock)
     state, code, residuals = iterate(task, value, clock)
@@ -92,7 +92,7 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
             fewer, forced = forced_only(task, clock)
         except Stopped as stop:
             return Settled(task, assumptions, reached, state, stop.status, residuals)
-        # where the disturbance can keep the state from the target, V is infinite and the iteration climbs without end
+        # where the disturbance can keep the state from the target, V is infinite and the iteration never ends
         if forced is not None and not forced.all():
             task, reached = fewer, forced
             # from the start, since the value so far is the result of that climb

@@ -39,7 +39,7 @@ COARSEST = 20_000  # nodes of the coarsest grid: for fewer a step takes under a 
 
 
 def check_on_one_state(problem: Problem, grid: Grid, scheme: object) -> None:
-    """Refuse functions that fail at a single state, and warn of those that take XLA minutes to compile."""
+    """Refuse functions that fail at a single state, and warn of functions that take XLA minutes to compile."""
     checks.shapes(problem, grid, scheme)
     count = checks.operations_of(problem, grid.ndim).single
     if count > OPERATIONS:
@@ -57,8 +57,8 @@ def choose(
 
     ``divided``: the nodes are divided among several devices, so no host has all of them.
 
-    Large grids are nested. For tubes without discount, whose policies have no value of their own, only value iteration
-    converges to the extreme one of many fixed points.
+    Large grids are nested. For tubes without discount, whose policies have no unique value, only value iteration
+    converges to the right one of many fixed points.
     """
     if method is not None:
         return method.filled(choose_evaluation(problem, grid, traced=traced, divided=divided))
@@ -350,13 +350,13 @@ def _least_rate(task: Task) -> Number:
 
 
 def _finite_part(task: Task, reached: Mask) -> Task:
-    """The task on the nodes with a finite value; the others are set above, so that no optimal action leads there."""
+    """The task on the nodes with a finite value; other nodes get a larger value, so no optimal action leads there."""
     obstacles = dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | ~jnp.asarray(reached))
     return dataclasses.replace(task, obstacles=obstacles, counted=task.counted & jnp.asarray(reached), has_lost=True)
 
 
 def is_carried_past(reach: Reach) -> bool:
-    """True if from some nodes the chain reaches the target with some probability, but under no policy surely."""
+    """True if some nodes reach the target with positive probability, but not with probability one under any policy."""
     return bool(np.any(reach.maybe & ~reach.surely))
 
 

@@ -189,8 +189,8 @@ class StationaryRun(StatesInChunks):
     def first_chunk(self, clock: Clock) -> int:
         """Evaluations of the first chunk on this grid, before any is timed there: the guess, and some steps.
 
-        The pace on a coarser grid predicts the steps; a finer one may exceed the cache, so half a chunk's time is
-        planned. There is a single step if steps take many passes over the nodes, and more of them on a finer grid.
+        The steps should take half the time of a chunk at the pace of a coarser grid, because a finer grid may exceed
+        the cache. If a step takes many passes over the nodes, and more passes on a finer grid, only one step is made.
         """
         evaluation = self.task.method.evaluation
         # the evaluation of the guess is one pass over the nodes, a step with a linear solve hundreds, so it is timed
@@ -321,7 +321,7 @@ class LanesRun:
         return status if self.rows.lanes.size else Status.CONVERGED
 
     def _note(self, lane: int, chunk: np.ndarray, residuals: int) -> None:
-        """Record the residuals of a lane's last chunk up to this number of residuals, once."""
+        """Append the residuals of a lane's last chunk, until this number of residuals is recorded."""
         missing = residuals - sum(map(len, self.histories[lane]))
         self.histories[lane].append(chunk[len(chunk) - missing :])
 

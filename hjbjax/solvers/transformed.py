@@ -75,7 +75,7 @@ class Found:
     Attributes:
       value: V, (*grid), at unreachable nodes a finite number above all others.
       policy: the optimal actions, and the defect of the equation under them.
-      fixed, counted: bool (*grid), the nodes with prescribed values, and those with a finite value.
+      fixed, counted: bool (*grid), the nodes with prescribed values, and the nodes with a finite value.
       floor: the lower bound imposed on the values.
       code, steps: as in ``Solution``.
       sharp: True for a solution by high-order slopes.

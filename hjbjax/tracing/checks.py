@@ -77,7 +77,7 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
 
 
 def refuse_prescribed(grid: Grid, name: str, why: str) -> None:
-    """Refuse prescribed ends on behalf of a function, with the reason.
+    """Refuse prescribed ends in a function that does not support them, with the reason.
 
     Raises:
       ValueError: the grid has prescribed ends.
@@ -149,7 +149,7 @@ def call(problem: Problem, name: str) -> str:
 
 
 def _names(problem: Problem, name: str) -> tuple[str, ...]:
-    """The arguments that the problem passes to one of its functions, by letters."""
+    """The arguments that the problem passes to one of its functions, as letters."""
     if name in OF_ACTION:
         return problem.arguments("x", "u", "d", "t")
     return problem.state_arguments("x", "t")

@@ -370,7 +370,7 @@ def _trace(function: Partial, arguments: Sequence[jax.ShapeDtypeStruct]) -> tupl
 
 
 def _with_mark(function: Partial, closed: jex.ClosedJaxpr | None) -> Partial:
-    """The function with the mark of its trace; without a trace it is equal to no other function."""
+    """The function with the mark of its trace; without a trace it does not equal any other function."""
     assert isinstance(function.func, Marked)
     found = (object(), True) if closed is None else fingerprint(closed.jaxpr, closed.consts)
     function.func.mark, function.func.whole = found

@@ -84,7 +84,7 @@ def _trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.Close
 
 
 class _Arrays:
-    """Algebra of arrays over the nodes; each has the rank of the grid, or zero."""
+    """The algebra of arrays over the nodes; each array has the rank of the grid, or rank zero."""
 
     def constant(self, value: Any, index: tuple[int, ...]) -> Numbers:
         return value[index] if np.ndim(value) else value

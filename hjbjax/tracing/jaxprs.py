@@ -17,7 +17,7 @@ from hjbjax.problem.types import Numbers
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-# The positions, among n operands, of those that a data-moving primitive moves. The other operands are indices. If an
+# The positions of the operands, among n, that a data-moving primitive moves. The other operands are indices. If an
 # index varies from node to node, the primitive moves different entries at every node, which requires ``vmap``.
 MOVES: dict[str, Callable[[int], Sequence[int]]] = {
     "broadcast_in_dim": lambda n: (0,),
@@ -164,7 +164,7 @@ def _in_use(constant: Any) -> Any:
 
 
 def inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:
-    """The jaxprs that an equation calls, without those that combine two entries of a scatter."""
+    """The jaxprs that an equation calls, except the jaxpr that combines two entries of a scatter."""
     found = []
     for name, value in eqn.params.items():
         for each in value if isinstance(value, (tuple, list)) else (value,):

@@ -1,13 +1,14 @@
-"""The data that a function reads from outside: to recognise equal functions, and to turn numbers into arguments.
+"""Find the data that a function reads from outside, to recognise equal functions and to turn numbers into arguments.
 
-A lambda in a loop, or a notebook cell that is run again, makes a new function with the same code. Its code, and what
-the code reads, decide whether it computes the same; comparing functions by identity would recompile for seconds.
+A lambda in a loop, or a notebook cell that runs again, makes a new function with the same code. Two functions compute
+the same result if they have the same code and this code reads the same data. If functions were compared by identity,
+each new one would cost seconds of compilation.
 
 ``for mass in masses: solve(Problem(lambda x, u: u / mass, ...), grid)`` would still compile a program for every mass,
-since a number that a function closes over is part of its computation. So the cells and globals that hold a number are
-found, and the function is rewritten with these numbers as an argument. They are then leaves of the problem like any
-other. A number stays in the function if it is used for more than arithmetic: an exponent decides how a cost depends on
-the control, an integer may be a shape, a comparison may choose between two branches.
+because a number that a function closes over is part of its computation. The numbers in cells and globals are therefore
+found and passed to a copy of the function as arguments, so they become leaves of the problem. A number stays in the
+function if it is used for more than arithmetic: an exponent determines how a cost depends on the control, an integer
+may be a shape, a comparison may choose between two branches.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ from hjbjax.tracing import jaxprs
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # of derivative rules, which every trace makes again
+ADDRESS = re.compile(r" at 0x[0-9a-f]+|id=\d+")  # addresses of derivative rules, which differ between traces
 CALLBACKS = ("pure_callback", "io_callback")
-# libraries whose functions do not change: a problem that only uses these needs no trace
+# libraries whose functions do not change; a problem that only uses these does not have to be traced
 LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
-# operations of a number with a state or a control that do not change how the result depends on these
+# operations with a number that do not change the kind of dependence on a state or a control
 ARITHMETIC = frozenset({"add", "add_any", "sub", "mul", "div", "max", "min", "atan2", "dot_general", "concatenate"})
 CALLED = frozenset({"jit", "pjit"})  # the same primitive in different versions of JAX
 INSIDE = "."  # between the name of a function and the name that it reads
@@ -49,11 +50,11 @@ NUMBERS = (int, float, np.integer, np.floating)
 def identity(thing: object, depth: int = 8) -> Hashable | None:
     """A value that is equal for parts of a problem that compute the same; None if a part reads data from outside.
 
-    For example a lambda written again, or a helper defined again with the same code.
+    It is equal, for example, for a lambda that is created twice, or a helper that is defined twice with the same code.
     """
-    if depth == 0:  # functions may call each other without end; None costs a trace and is always correct
+    if depth == 0:  # functions may call each other recursively; None costs a trace and is always correct
         return None
-    # numbers besides the leaves cannot change: a Partial keeps its own, and a JAX dataclass is frozen or copied
+    # other numbers than leaves cannot change: a Partial keeps its numbers, and a JAX dataclass is frozen or copied
     if thing is None or isinstance(thing, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
         return "leaf"
     if isinstance(thing, Partial):
@@ -71,7 +72,7 @@ def identity(thing: object, depth: int = 8) -> Hashable | None:
 
 
 def _identities(things: Iterable[object], depth: int) -> Hashable | None:
-    """The identities of several parts; None if one of them has none."""
+    """The identities of several parts; None if the identity of any part is None."""
     found = [identity(each, depth - 1) for each in things]
     return None if None in found else tuple(found)
 
@@ -119,9 +120,9 @@ def code(function: Callable) -> object:
 
 
 def fingerprint(jaxpr: jex.Jaxpr, consts: Iterable[Numbers] = ()) -> tuple[tuple[Hashable, ...], bool]:
-    """A mark of what a jaxpr computes, including all its numbers, and True if the mark is complete.
+    """A mark of the computation of a jaxpr, including all its numbers, and True if the mark is complete.
 
-    A jaxpr does not contain the computations of derivative rules, except for JAX's own.
+    It is incomplete if the jaxpr has custom derivative rules other than JAX's own, because it does not contain them.
     """
     account = _Account()
     account.take(jaxpr, consts)
@@ -132,7 +133,7 @@ class _Account:
     """A digest of a jaxpr, the host functions that it calls, and True if they describe the whole computation."""
 
     def __init__(self) -> None:
-        self.digest = hashlib.blake2b(digest_size=16)  # two of 10^10 functions share 128 bits once in 10^18 cases
+        self.digest = hashlib.blake2b(digest_size=16)  # two of 10^10 functions share a digest with probability 1e-19
         self.callbacks: list[Hashable] = []
         self.whole = True
 
@@ -143,7 +144,7 @@ class _Account:
             self._tell(numbers.setdefault(var, len(numbers)), str(var.aval))
         for value in consts:
             self._number(value)
-        for eqn in (*jaxpr.eqns, None):  # None: the outputs of the whole, like the operands of an equation
+        for eqn in (*jaxpr.eqns, None):  # None: the outputs of the jaxpr, treated like the operands of an equation
             operands, results = (jaxpr.outvars, ()) if eqn is None else (eqn.invars, eqn.outvars)
             self._tell("" if eqn is None else eqn.primitive.name)
             for operand in operands:
@@ -181,7 +182,7 @@ class _Account:
             self._tell(ADDRESS.sub("", repr(value)))
 
     def _number(self, value: Numbers) -> None:
-        array = np.asarray(value)  # its bits, since printing rounds numbers and abridges long arrays
+        array = np.asarray(value)  # the bits, because printing rounds numbers and abridges long arrays
         self._tell(array.dtype, array.shape)
         self.digest.update(array.tobytes())
 
@@ -208,11 +209,11 @@ def _called(callback: object) -> Hashable:
 
 
 class Composite:
-    """A function whose leading arguments hold other functions, as a function of the numbers in these arguments.
+    """A function whose leading arguments contain other functions, as a function of the numbers in these arguments.
 
     ``Partial(negative, Partial(distance, 0.5))`` is a pytree with ``distance`` in its structure, so two of them are
-    equal only for the same object ``distance``. ``Partial(Composite(negative, distance), ((0.5,), {}))`` is equal to
-    another one by what it computes, like any function, and the numbers that ``distance`` reads are found.
+    equal only if ``distance`` is the same object. ``Partial(Composite(negative, distance), ((0.5,), {}))`` is compared
+    by its computation, like any other function, and the numbers that ``distance`` reads are found.
 
     Args:
       function: the outer function.
@@ -237,7 +238,7 @@ class Composite:
 
 
 def unnested(function: Partial) -> Partial:
-    """A ``Partial`` whose arguments hold no other ``Partial``."""
+    """An equal ``Partial`` whose arguments do not contain another ``Partial``."""
     leaves, structure = jax.tree.flatten((function.args, function.keywords), is_leaf=_is_partial)
     if not any(map(_is_partial, leaves)):
         return function
@@ -248,12 +249,12 @@ def unnested(function: Partial) -> Partial:
 
 
 def _is_partial(thing: object) -> TypeGuard[Partial]:
-    """True for a function with some of its arguments."""
+    """True for a ``Partial``: a function with some of its arguments."""
     return isinstance(thing, Partial)
 
 
 def text_of_called(called: Any) -> str:
-    """A description of a host function in a fingerprint, the same in every process, by its code and what it holds."""
+    """A description of a host function by its code and its data, the same in every process, for a fingerprint."""
     function = called[0] if isinstance(called, tuple) else getattr(called, "__func__", called)
     owner = getattr(called, "__self__", None)
     held = [content(cell) for cell in getattr(function, "__closure__", None) or ()]
@@ -267,19 +268,19 @@ def text_of_called(called: Any) -> str:
 
 
 def _text_of_code(found: object) -> str:
-    """The instructions of a function, with those of the functions that it makes; no line numbers and addresses."""
+    """The instructions of a function and of the functions defined in it, without line numbers and addresses."""
     if not isinstance(found, types.CodeType):
         return repr(found)
     return repr((found.co_code, found.co_names, [_text_of_code(each) for each in found.co_consts]))
 
 
 class OfNumbers:
-    """A function of the numbers that it reads under ``names``, and of its own arguments."""
+    """A function of its own arguments and of the numbers that it reads under ``names``."""
 
     def __init__(self, function: Callable, names: Sequence[str]):
-        assert isinstance(function, (types.FunctionType, Composite))  # other callables read nothing by name
+        assert isinstance(function, (types.FunctionType, Composite))  # other callables do not read anything by name
         self.function, self.names = function, tuple(names)
-        self.__code__ = function.__code__  # distinguishes it from others, together with its mark
+        self.__code__ = function.__code__  # distinguishes the function from others, together with its mark
         own = inspect.signature(function)
         first = inspect.Parameter("numbers", inspect.Parameter.POSITIONAL_ONLY)
         self.__signature__ = own.replace(parameters=[first, *own.parameters.values()])
@@ -300,7 +301,7 @@ class OfNumbers:
 
 
 def _reading(function: Any, numbers: dict[str, Any]) -> Any:
-    """A copy of a function that reads ``numbers`` by name; ``helper.name`` is a name in a function that it calls."""
+    """A copy of a function that reads ``numbers`` instead; ``helper.name`` is the name in a function that it calls."""
     values: dict[str, Any] = {}
     for name, number in numbers.items():
         helper, _, inner = name.partition(INSIDE)
@@ -353,7 +354,7 @@ def _each(function: Composite) -> Iterable[tuple[int, Any]]:
 def _read(function: types.FunctionType) -> dict[str, Any]:
     """The values of the globals and the cells that a function's own code names.
 
-    A global with the name of an attribute is found too, and then not read, which is harmless.
+    A global with the name of an attribute is included too, although the function does not read it; this is harmless.
     """
     found = {name: function.__globals__.get(name) for name in names_read(function.__code__)}
     return found | {
@@ -363,7 +364,7 @@ def _read(function: types.FunctionType) -> dict[str, Any]:
 
 
 def _writes(code: types.CodeType) -> bool:
-    """True if code rebinds a global or a name of an enclosing function, which a copy would miss."""
+    """True if code rebinds a global or a name of an enclosing function. A copy would not have this effect."""
     for each in dis.get_instructions(code):
         if each.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
             return True
@@ -394,7 +395,7 @@ def decisive(jaxpr: jex.Jaxpr, variables: Sequence[jex.Var]) -> set[int]:
 
 
 def _follow(jaxpr: jex.Jaxpr, owners: dict[jex.Var, frozenset[int]]) -> tuple[set[int], list[frozenset[int]]]:
-    """Positions of the decisive variables, and for each output the positions it was made from.
+    """Positions of the decisive variables, and for each output the positions of the variables it depends on.
 
     ``owners``: for each variable that is known before any state, the positions it was made from.
     """

@@ -1,10 +1,11 @@
 """The nodes from which the target can be reached with certainty, from the graph of the chain.
 
-Without discount the value is finite exactly where some policy (a proper policy) reaches the fixed nodes with
-probability one. The largest such set R is a fixed point: remove the nodes without a path of jumps to the target by
-actions that keep every jump inside R, until nothing changes. The jumps of sampled actions are computed on the device.
-The paths are followed on the host by sweeps: one cumulative "or" along an axis follows all jumps in one direction to
-their end, so two or three rounds of sweeps usually find every path, however long.
+Without discount the value is finite at a node if and only if some policy (a proper policy) reaches the fixed nodes from
+there with probability one. The set R of these nodes is a largest fixed point: start with all nodes, and remove the
+nodes without a path of jumps to the target by actions that keep every jump inside R, until nothing changes. The jumps
+of sampled actions are computed on the device. The paths are followed on the host by sweeps: one cumulative "or" along
+an axis follows all jumps in one direction to their end, so two or three rounds of sweeps usually find every path,
+however long.
 """
 
 import functools
@@ -34,7 +35,7 @@ LOOK = 10**7  # nodes times actions between two checks of the clock: about a sec
 def _open_jumps(
     on: Discretisation, points: Array, count: int, clock: Clock, inside: jax.Array | None, *, least: Number, kinks: bool
 ) -> Rates:
-    """For every jump the nodes, bool (*grid), with an action that makes it and whose jumps all stay ``inside``.
+    """For every jump, the nodes with an action that makes this jump and whose jumps all stay ``inside``, bool (*grid).
 
     Tries the first ``count`` actions of ``points``. ``inside=None`` means the box. Rates up to ``least`` count as
     rounding. With ``kinks``, the actions between samples at which a component of the drift vanishes are tried too.
@@ -164,10 +165,10 @@ def _reached_by(open_jumps: Callable[..., Rates], held: np.ndarray, surely: bool
 def forced(on: Discretisation, held: np.ndarray, *, least: Number, clock: Clock) -> np.ndarray:
     """The nodes of a game from which the control reaches the fixed nodes surely, whatever the disturbance does.
 
-    This is the largest set R in which some control keeps all jumps inside under every disturbance and leads to a nearer
-    node; in a lower game, for every disturbance there is some control. A continuum is sampled by few actions. Arguments
-    as for ``reached``. Takes one step per cell of the longest path, each over all pairs of actions, so use it for
-    failing games.
+    This is the largest set R in which some control keeps all jumps inside R and leads to a nearer node under every
+    disturbance. In a lower game the control may depend on the disturbance. A continuum is sampled by few actions.
+    Arguments as for ``reached``. Takes one step per cell of the longest path, each over all pairs of actions, so use it
+    for failing games.
     """
     found, on = np.ones(on.grid.shape, bool), on.on_grid(stencil.walled(on.grid))
     while True:
@@ -236,7 +237,7 @@ def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar 
     )
     pairs = np.concatenate([np.repeat(u, len(d), axis=0), np.tile(d, (len(u), 1))], axis=1)
     count = len(pairs)
-    if dearest is not None:  # usually few actions are cheap anywhere, and each is tried many times
+    if dearest is not None:  # usually only few actions are cheap at any node, so select them once
         cheap = np.asarray(_cheap_somewhere(on, start, dearest, pairs))
         pairs, count = np.concatenate([pairs[cheap], pairs[~cheap]]), int(np.sum(cheap))
     return _refuge(on, start, dearest, pairs, count)

@@ -113,7 +113,7 @@ def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock:
 
 @jax.jit
 def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar) -> Verdict:
-    """True if no action from ``first`` to before ``last`` is at fault; the first batch also checks the state."""
+    """True without a fault under the actions first, …, last − 1; the first batch also checks functions of the state."""
     # functions of the state are checked once, with the first batch
     amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
     x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)
@@ -167,7 +167,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
         carry: dict[str, _Finding], index_and_action: tuple[Scalar, jax.Array, jax.Array]
     ) -> tuple[dict[str, _Finding], None]:
         index, u, d = index_and_action
-        here, u, d = jax.lax.optimization_barrier((x, u, d))  # otherwise XLA keeps an array of all nodes per invariant
+        here, u, d = jax.lax.optimization_barrier((x, u, d))  # otherwise XLA stores loop invariants at all nodes
         new = {name: _count(bad, grid, index) for name, bad in _faults(on, here, list(u), list(d)).items()}
         kept = {
             name: jax.tree.map(functools.partial(jnp.where, carry[name].nodes > 0), carry[name], new[name])
@@ -176,7 +176,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
         return kept, None
 
     us, ds = (jnp.asarray(action, on.dtype) for action in actions)
-    # keep the first action at fault and its count, not the sum over all actions
+    # keep the first action with a fault and its count, not the sum over all actions
     nothing = _Finding(*(jnp.zeros((), jnp.int64),) * 3)
     names = jax.eval_shape(lambda: _faults(on, x, list(us[0]), list(ds[0])))
     carry, _ = jax.lax.scan(body, dict.fromkeys(names, nothing), (jnp.arange(len(us)), us, ds))
@@ -257,7 +257,7 @@ def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple[np.nd
 def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Finding, actions: tuple) -> NoReturn:
     """Refuse a function that is NaN or infinite at some nodes."""
     ingredient = getattr(problem, name)
-    # a constant is at fault everywhere, so no node is named
+    # a constant is wrong everywhere, so no node is named
     if not callable(ingredient):
         raise ValueError(f"Problem.{problem.labels.word(name)}: got {np.asarray(ingredient)}, wanted finite numbers")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)

@@ -62,7 +62,7 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
 def beside_samples(on: Discretisation, player: Player) -> list[list]:
     """The actions to try once, in addition to all samples; each input (*grid).
 
-    A single input is set to where a component of the drift vanishes; for a ball see ``_of_a_ball``.
+    A single input takes the values at which a component of the drift vanishes; for a ball see ``_of_a_ball``.
     """
     if not _knows_kinks(on, player):
         return []
@@ -80,7 +80,7 @@ def _knows_kinks(on: Discretisation, player: Player) -> bool:
 
 
 def _of_a_ball(on: Discretisation, ball: Ball, player: Player) -> list[list]:
-    """The actions of a ball that go furthest along one input while others let their components vanish.
+    """The actions of a ball in which some inputs let their components vanish and one input is as large as possible.
 
     Each input u_j drives its own component f_j. Among the actions with given signs of all f_j, the action with the
     largest |f_k| has some inputs S at their kinks, f_S = 0, the other inputs zero, and the remaining radius in u_k.

@@ -87,7 +87,7 @@ class Lander:
                 -faster * duration - first * longer + self.gravity * duration * longer - q * longer / self.consumption
             )
             slope = first * faster + self.gravity * higher
-            # Newton step for √needed − √energy, expanded by √needed: √E is nearly linear in q, E is not
+            # Newton step for √needed − √energy, because √E is nearly linear in q and E is not; expanded by √needed
             q = q - 2 * (needed - jnp.sqrt(needed * energy)) / slope
         return jnp.where(resting, 0.0, q)
 

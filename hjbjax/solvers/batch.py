@@ -159,8 +159,8 @@ def solve_batch(
                         together = _solve_side_by_side(members_of, chosen, tol, clock, kept, choices)
                 for index, solution in zip(some, together, strict=True):
                     solutions[index] = solution
-        if solutions and not any(solution.status in CUT for solution in solutions):
-            solutions[-1] = with_last_phase(solutions[-1], clock)  # catches a late Ctrl-C
+    if solutions and not any(solution.status in CUT for solution in solutions):
+        solutions[-1] = with_last_phase(solutions[-1], clock)  # catches a late Ctrl-C
     for index, solution in enumerate(solutions):
         solution.stats.update({} if kept is None else {"checkpoint": kept.outcome})
         if throw and solution.status is not Status.CONVERGED:

@@ -174,7 +174,7 @@ def march(
         needed = memory.fitting(memory.of_march(on, len(kept), method, policy=policy), grid, max_memory)
         with host_loop.with_solution(clock, needed, lambda _: _solution_at_horizon(asked, Status.INTERRUPTED)):
             solution = _with_estimates(asked, clock)
-        solution = with_last_phase(solution, clock)
+    solution = with_last_phase(solution, clock)  # after the last write of the checkpoint, which may take long
     solution.stats.update(
         seconds=clock.stepping, compile_seconds=clock.elapsed() - clock.stepping, bytes=needed, horizon=horizon,
         start=start is not None,

@@ -167,7 +167,8 @@ def solve(
         check_on_one_state(problem, grid, on.scheme)  # before the memory check, which reads functions
         needed = memory.require(problem, grid, method, kind, max_memory)
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
-            solution = with_last_phase(solve_on_host(on, method, tol, guess, clock, choices, mesh), clock)
+            solution = solve_on_host(on, method, tol, guess, clock, choices, mesh)
+    solution = with_last_phase(solution, clock)  # after the last write of the checkpoint, which may take long
     solution.stats.setdefault("method", method.described(problem.is_game))
     solution.stats.update(bytes=needed, **({} if mesh is None else {"mesh": mesh.devices.shape}))
     return _ended(solution, clock, tol, throw=throw)

@@ -368,6 +368,30 @@ def test_another_folder_meanwhile_sends_the_file_nowhere_else(tmp_path, monkeypa
     assert counts(tmp_path / "first" / "run.npz") == {"run": [0.0]}
 
 
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda **kept: hjb.solve(posed(), LINE, **kept),
+        lambda **kept: hjb.march(posed(), LINE, 0.1, **kept),
+        lambda **kept: hjb.solve_batch([posed(), posed()], LINE, **kept),
+    ],
+    ids=["solve", "march", "solve_batch"],
+)
+def test_ctrl_c_during_the_last_write_is_not_lost(run, tmp_path, monkeypatch):
+    """The write of a large state takes as long as its disk."""
+    write, path = checkpoints.File.write, tmp_path / "run.npz"
+
+    def pressed(file):
+        os.kill(os.getpid(), signal.SIGINT)
+        write(file)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoints.File, "write", pressed)
+        with pytest.raises(hjb.SolveError, match="interrupted after it had finished"):
+            run(checkpoint=hjb.Checkpoint(path, every=np.inf))
+    run(checkpoint=path, resume=True)
+
+
 def test_a_run_that_is_refused_leaves_no_file_and_takes_none(tmp_path):
     path = tmp_path / "run.npz"
     broken = hjb.Problem(lambda x, u: u * jnp.nan, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)

@@ -27,7 +27,8 @@ def count_of(problem: Problem, n: int) -> int:
       ValueError: the function does not return a ``Box``, or cannot be traced.
     """
     said = f"controls({', '.join(problem.state_arguments('x', 't'))})"
-    state = problem.state_arguments(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in ((n,), ())))
+    word = jnp.result_type(float)  # of the caller: newer JAX warns about float64 where 64-bit types are off
+    state = problem.state_arguments(*(jax.ShapeDtypeStruct(shape, word) for shape in ((n,), ())))
     found: list[Any] = []
     try:
         jax.eval_shape(lambda *where: found.append(problem.controls(*where)), *state)

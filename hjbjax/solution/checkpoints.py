@@ -418,9 +418,12 @@ def _read(path: str, question: Mapping[str, str]) -> dict[str, list[Record]]:
 
     def rebuild(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, list[Record]]:
         made_for = header["asked"]
-        if other := sorted(key for key in question.keys() | made_for.keys() if question.get(key) != made_for.get(key)):
-            raise FileError(f"it was made for another {' and '.join(other)}; give another path, or remove the file")
-        if header["versions"] != versions():
+        changed = header["versions"] != versions()
+        if other := _difference(question, made_for):
+            # JAX may write the operations of a function differently in another version
+            since = f", or the same with other versions ({_words(header['versions'])}; now {_words(versions())})"
+            raise FileError(f"it was made {other}{since if changed else ''}; give another path, or remove the file")
+        if changed:
             warn(f"{path}: the checkpoint was made with {header['versions']}; the last bits of the answer may differ")
         return {
             name: [
@@ -431,6 +434,19 @@ def _read(path: str, question: Mapping[str, str]) -> dict[str, list[Record]]:
         }
 
     return files.read(path, FORMAT, VERSION, _plan, rebuild)
+
+
+def _difference(question: Mapping[str, str], made_for: Mapping[str, str]) -> str:
+    """The difference between two questions in words; empty if there is none."""
+    if question.keys() != made_for.keys():
+        return "for another function, or another number of problems"
+    other = sorted(key for key in question if question[key] != made_for[key])
+    return f"for another {' and '.join(other)}" if other else ""
+
+
+def _words(versions: Mapping[str, str]) -> str:
+    """Names with their versions."""
+    return ", ".join(f"{name} {version}" for name, version in versions.items())
 
 
 def _plan(header: dict) -> dict[str, Expected]:

@@ -7,6 +7,7 @@ and rejects declared sizes that exceed the file's own size, so a false claim of 
 raises ``FileError``.
 """
 
+import errno
 import json
 import math
 import os
@@ -188,7 +189,9 @@ def read(
     except FileError as error:
         reason, cause = str(error), error.__cause__ or error
     except OSError as error:
-        reason, cause = error.strerror or str(error), error
+        # offsets in a damaged table of contents may lie before the start of the file
+        reason = "it is damaged" if error.errno == errno.EINVAL else error.strerror or str(error)
+        cause = error
     except zipfile.BadZipFile as error:
         reason, cause = f"it is damaged: {error}", error
     except Exception as error:  # zipfile, json and numpy raise a dozen types for damaged bytes

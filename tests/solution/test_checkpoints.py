@@ -184,7 +184,7 @@ def posed(weight=1.0):
 LINE = hjb.Grid([-1.0], [1.0], (21,))
 
 
-def test_the_file_of_another_question_is_refused(tmp_path):
+def test_the_file_of_another_question_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "run.npz"
     hjb.solve(posed(), LINE, checkpoint=path)
     before = path.read_bytes()
@@ -200,6 +200,12 @@ def test_the_file_of_another_question_is_refused(tmp_path):
         with pytest.raises(hjb.FileError, match=f"run.npz.*it was made for another {word}; give another path"):
             hjb.solve(problem, grid, checkpoint=path, resume=True, **options)
     assert path.read_bytes() == before
+    with pytest.raises(hjb.FileError, match="it was made for another function, or another number of problems"):
+        hjb.march(posed(), LINE, 1.0, checkpoint=path, resume=True)
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoints, "versions", lambda: {"jax": "99"})
+        with pytest.raises(hjb.FileError, match=r"another problem, or the same with other versions \(.*; now jax 99\)"):
+            hjb.solve(posed(1.5), LINE, checkpoint=path, resume=True)
     # the same question in other words: a function written anew
     hjb.solve(posed(), LINE, checkpoint=path, resume=True)
 

@@ -305,6 +305,14 @@ def test_every_truncation_is_refused(tmp_path):
         refused(path, "truncated|not an npz file|damaged")
 
 
+def test_a_lost_byte_is_refused(tmp_path):
+    path = tmp_path / "run.npz"
+    data = good(path)
+    for place in range(4, len(data), 401):
+        path.write_bytes(data[:place] + data[place + 1 :])
+        refused(path, "truncated|damaged")
+
+
 @pytest.mark.slow
 def test_every_flipped_bit_is_refused_or_without_consequence(tmp_path):
     path, random = tmp_path / "run.npz", np.random.default_rng(0)

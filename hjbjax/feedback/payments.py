@@ -24,6 +24,7 @@ from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.solution.interpolation import Samples, between, query
 from hjbjax.solution.rewards import in_costs
@@ -102,7 +103,7 @@ def _surplus(problem: Problem, solution: Solution) -> jax.Array:
     """ψ − V at the nodes and at all stored times; its square root with noise."""
     value, grid = jnp.asarray(solution.value), solution.grid
     # cast as in a solve: 1 + c in single precision is a different number, and V would not equal ψ
-    problem = cast(settled(problem, grid.ndim, value.dtype), value.dtype)
+    problem = cast(settled(with_any_control(problem, grid.ndim), grid.ndim, value.dtype), value.dtype)
     x = grid.components(value.dtype)
 
     def price(t: Number) -> jax.Array:

@@ -138,6 +138,22 @@ def test_bounds_without_a_control_and_other_results_are_refused(controls, said):
         hjb.solve(hjb.Problem(steer, paid, controls, discount=0.5), GRID)
 
 
+def test_a_path_that_may_be_stopped_ends_where_v_says():
+    """Bounds that happen to be the same at all states; ``simulate`` refused them where stopping has a cost."""
+
+    def price(x):
+        return jnp.sin(3 * x[0]) ** 2
+
+    def stopped(controls):
+        return hjb.Problem(lambda x, u: u, lambda x, u: 0.3 + u @ u, controls, discount=0.5, stopping_cost=price)
+
+    problem, fixed = stopped(lambda x: hjb.Box(-1 + 0 * x, 1 + 0 * x)), stopped(hjb.Box([-1.0], [1.0]))
+    line = hjb.Grid([-1.5], [1.5], (61,))
+    path, other = (hjb.simulate(each, hjb.solve(each, line), [0.6], 5.0) for each in (problem, fixed))
+    assert path.status is other.status
+    assert path.cost == pytest.approx(other.cost, rel=1e-9)
+
+
 def test_what_needs_a_fixed_set_says_so():
     problem = hjb.Problem(steer, paid, speed, discount=0.5)
     with pytest.raises(ValueError, match="pontryagin: got bounds of the controls that depend on the state"):

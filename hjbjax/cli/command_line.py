@@ -75,11 +75,7 @@ class OneLineGroup(click.Group):
             for stream in (sys.stdout, sys.stderr):
                 streams.Expendable(stream).flush()
             os._exit(code)  # JAX may still be at work, and a normal exit would wait for it or crash
-        try:
-            if sys.stderr is not None:
-                sys.stderr.flush()
-        except OSError:  # the interpreter would fail on the rest at exit, with code 120
-            streams.let_go(sys.stderr)
+        streams.flush_or_let_go(sys.stderr)  # otherwise the exit code is 120 on a full disk
         sys.exit(code)
 
 

@@ -105,6 +105,16 @@ def let_go(stream: Any) -> None:
         os.close(nowhere)
 
 
+def flush_or_let_go(stream: Any) -> None:
+    """Flush a stream at the end of a process, or discard the text that it cannot write."""
+    try:
+        stream.flush()
+    except OSError:
+        let_go(stream)
+    except Exception:  # None, a closed stream, a replacement object
+        return
+
+
 # --- text that a stream can show ---
 
 

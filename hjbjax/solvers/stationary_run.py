@@ -187,12 +187,13 @@ class StationaryRun(StatesInChunks):
         super().__init__(task, fixed_point.start(task, guess), _run_kept if _calls_back(task) else run, guess, limit)
 
     def first_chunk(self, clock: Clock) -> int:
-        """Evaluations of the first chunk on this grid, before any is timed there: the guess, and some steps.
+        """Evaluations of the first chunk on this grid, before any is timed there: a new guess, and some steps.
 
         The steps should take half the time of a chunk at the pace of a coarser grid, because a finer grid may exceed
         the cache. If a step takes many passes over the nodes, and more passes on a finer grid, only one step is made.
         """
         evaluation = self.task.method.evaluation
+        guesses = int(self.evaluations == 0)  # a resumed state has been evaluated
         # the evaluation of the guess is one pass over the nodes, a step with a linear solve hundreds, so it is timed
         # separately
         if clock.per_node is None and self.nodes > MANY_NODES:
@@ -200,12 +201,12 @@ class StationaryRun(StatesInChunks):
         # a Krylov or direct solve takes more passes on finer grids, and so do the replies of a game: the time of a step
         # on a coarser grid does not predict them
         if self.task.problem.is_game or (evaluation is not None and not evaluation.rough):
-            return 2
+            return guesses + 1
         if clock.per_node is None:
             steps = FIRST_NODES / self.nodes
         else:
             steps = clock.steps_in(min(CHUNK_SECONDS / 2, clock.seconds - clock.elapsed()), self.nodes)
-        return 1 + int(np.clip(steps, 1, HISTORY - 1))
+        return guesses + int(np.clip(steps, 1, HISTORY - 1))
 
 
 class RunInParts(StationaryRun):

@@ -45,18 +45,26 @@ def both(running=running, **more):
     return costs, rewards
 
 
+def close(one, other):
+    """Equal up to rounding: the sign decides which products XLA rounds before it adds them."""
+    np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-13)
+
+
 def same(cost, reward):
-    """The two solutions are each other's negatives, to the last bit."""
-    assert np.array_equal(cost.value, -reward.value)
-    assert np.array_equal(cost.policy, reward.policy, equal_nan=True)
+    """The two solutions are each other's negatives, up to rounding."""
+    close(cost.value, -reward.value)
+    close(cost.policy, reward.policy)
     assert (cost.labels.payoff, reward.labels.payoff) == ("cost", "reward")
     assert (cost.bounds is None) == (reward.bounds is None)
     if cost.bounds is not None:
-        assert np.array_equal(cost.bounds[0], -reward.bounds[1])
-        assert np.array_equal(cost.bounds[1], -reward.bounds[0])
-        assert cost.error == reward.error
+        close(cost.bounds[0], -reward.bounds[1])
+        close(cost.bounds[1], -reward.bounds[0])
+        assert cost.error == pytest.approx(reward.error, rel=1e-6, abs=1e-12)
     for name in ("grid_error", "box_error"):
-        assert np.array_equal(getattr(cost, name), getattr(reward, name)), name
+        one, other = getattr(cost, name), getattr(reward, name)
+        assert (one is None) == (other is None), name
+        if one is not None:
+            close(one, other)
 
 
 @pytest.fixture(scope="module")
@@ -66,13 +74,13 @@ def pair():
     return costs, rewards, *(hjb.solve(each, GRID, scheme=hjb.Upwind()) for each in (costs, rewards))
 
 
-def test_a_reward_is_minus_a_cost_to_the_last_bit(pair):
+def test_a_reward_is_minus_a_cost(pair):
     same(*pair[2:])
     assert pair[3].problem is pair[1]
 
 
 @pytest.mark.slow
-def test_a_reward_of_second_order_is_minus_a_cost_to_the_last_bit():
+def test_a_reward_of_second_order_is_minus_a_cost():
     costs, rewards = both()
     same(*(hjb.solve(each, GRID) for each in (costs, rewards)))
 

@@ -48,18 +48,16 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
     """Decorate a public function; ``discounting`` makes the discount of each problem constant."""
     first, second = list(inspect.signature(function).parameters)[:2]
 
+    def posed(problem: Problem, grid: Grid) -> Problem:
+        return discounting(_with_fixed_set(problem, grid, function.__name__), grid, function.__name__)
+
     def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
         asked, grid = given[first], given[second]
         problems = [asked] if isinstance(asked, Problem) else asked if isinstance(asked, list) else []
         if not any(map(_depends_on_state, problems)):
             return function(**given)
         if isinstance(grid, Grid):
-            made = [
-                discounting(_with_fixed_set(each, grid, function.__name__), grid, function.__name__)
-                if _depends_on_state(each)
-                else each
-                for each in problems
-            ]
+            made = [posed(each, grid) if _depends_on_state(each) else each for each in problems]
             given[first] = made[0] if isinstance(asked, Problem) else made
         try:
             found = function(**given)

@@ -24,6 +24,7 @@ from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
 from hjbjax.markov_chain import chain
 from hjbjax.problem.ends import Dirichlet, Neumann, Robin
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.stretching import Sinh
@@ -58,6 +59,7 @@ __all__ = [
     "Implicit",
     "Krylov",
     "Limited",
+    "Modes",
     "Nested",
     "Neumann",
     "PolicyIteration",

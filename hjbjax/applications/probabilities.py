@@ -18,6 +18,7 @@ import numpy as np
 
 from hjbjax.applications import exit_problems
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.posing import with_mode_axis
 from hjbjax.discretisation.schemes import Upwind, check_slopes
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.iteration.methods import ValueIteration
@@ -38,6 +39,7 @@ from hjbjax.well_posedness import attainability, node_checks
 TOL = 1e-6  # the default 1e-3 of ``solve`` would show in the third digit of a probability
 
 
+@with_mode_axis("target", "obstacle", "region", "feedback")
 @front_door
 def reach_probability(
     problem: Problem,
@@ -114,6 +116,7 @@ def reach_probability(
         return _answer(question, grid, horizon, options, sign)
 
 
+@with_mode_axis("target", "obstacle", "region", "feedback")
 @front_door
 def stay_probability(
     problem: Problem,
@@ -162,6 +165,7 @@ def stay_probability(
     return _affine(left, 1.0, -1.0)
 
 
+@with_mode_axis("target", "obstacle", "region", "feedback")
 @front_door
 def expected_exit_time(
     problem: Problem,

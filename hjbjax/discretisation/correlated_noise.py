@@ -215,5 +215,5 @@ def lacking(on: Discretisation, a: dict[tuple[int, int], jax.Array]) -> jax.Arra
     if all(i == j for i, j in a):
         return None
     slack = 16 * on.grid.ndim * jnp.finfo(on.dtype).eps  # rounding in σσᵀ and in the spacings
-    short = (stencil.noise_along(a, on.grid, i) < -slack * jnp.asarray(a[i, i], on.dtype) for i in range(on.grid.ndim))
+    short = (stencil.noise_along(a, on.grid, i) < -slack * jnp.asarray(a[i, i], on.dtype) for i in on.grid.state_axes)
     return functools.reduce(jnp.logical_or, short)

@@ -29,7 +29,7 @@ def level(values: Field, grid: Grid) -> Field:
     two one-sided slopes is used, since the other may cross a jump.
     """
     eps, slack = jnp.finfo(values.dtype).eps, jnp.zeros((), values.dtype)
-    for axis in range(grid.ndim):
+    for axis in grid.state_axes:
         up, down = stencil.one_sided(values, grid, axis)
         # coordinates are computed from lo and hi, so their error is relative to the larger, even near zero
         farthest = jnp.maximum(jnp.abs(grid.lo[axis]), jnp.abs(grid.hi[axis]))
@@ -66,6 +66,9 @@ def links(x: Sequence[Any], here: Field, exit_cost: Callable[[list], Any], grid:
     result = []
     for axis in range(grid.ndim):
         link = stencil.grid_links(grid, axis)
+        if axis not in grid.state_axes:
+            result.append(link)
+            continue
         (up, meets_up), (down, meets_down) = cut(axis, 1, link.up), cut(axis, -1, link.down)
         # beyond a wall is the mirror image of the cut link
         mirrored = jnp.where(stencil.wall(grid, axis, 1), down, up), jnp.where(stencil.wall(grid, axis, -1), up, down)

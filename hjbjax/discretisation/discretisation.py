@@ -272,10 +272,25 @@ class Discretisation:
             places = self.coordinates() if x is None else x
             sigma = components.components(lambda x: jnp.asarray(noise, self.dtype), places, dtype=self.dtype)
         if sigma.ndim < 2:  # one number, or one per axis: independent noise, a diagonal a
-            return {(i, i): s * s for i, s in enumerate(np.broadcast_to(sigma, (n,)))}
+            spread = np.broadcast_to(sigma, (n,))
+            return {(i, i): spread[i] * spread[i] for i in self.grid.state_axes}
         # σ of shape (n, k): a_ij = Σ_l σ_il σ_jl is symmetric, so i ≤ j suffices
-        pairs = itertools.combinations_with_replacement(range(n), 2)
+        pairs = itertools.combinations_with_replacement(self.grid.state_axes, 2)
         return {(i, j): sum(p * q for p, q in zip(sigma[i], sigma[j], strict=True)) for i, j in pairs}
+
+    def mode_rates(self, u: list, d: list | None = None, x: list | None = None) -> list:
+        """The rates of jumps over 1, ..., k − 1 modes; empty without random changes of the mode."""
+        rates = self.problem.mode_rates
+        return [] if rates is None else list(components.components(rates, *self._arguments(u, d, x), dtype=self.dtype))
+
+    def switching_costs(self) -> list:
+        """The costs of changing the mode by 1, ..., k − 1, each (*grid); empty if the controller cannot change it."""
+        costs = self.problem.switching_costs
+        if costs is None:
+            return []
+        where = self.problem.state_arguments(self.coordinates(), self.t)
+        found = components.components(costs, *where, dtype=self.dtype)
+        return [jnp.broadcast_to(jnp.asarray(cost, self.dtype), self.grid.shape) for cost in found]
 
     @property
     def decay(self) -> Any:
@@ -310,7 +325,8 @@ class Discretisation:
             f, a = self.drift(u, d, x), self.diffusion(u, d, x)
             for axis, link in enumerate(links):
                 left = stencil.noise_along(a, self.grid, axis)
-                found[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
+                if axis in self.grid.state_axes:
+                    found[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
         return found
 
     def _probes(self) -> list[tuple[list, list]]:

@@ -63,7 +63,7 @@ def slack(on: Discretisation) -> list[Rounding]:
         # zero need not be admissible: if the formula has no value there, nothing can cancel
         idle = jnp.broadcast_to(jnp.where(jnp.isfinite(entry), entry, 0), grid.shape)
         shift = jnp.zeros((), dtype)
-        for axis in range(grid.ndim):
+        for axis in grid.state_axes:
             up, down = (jnp.abs(slope) for slope in stencil.one_sided(idle, grid, axis))
             end = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)
             farthest = jnp.maximum(jnp.abs(grid.lo[axis]), jnp.abs(grid.hi[axis]))

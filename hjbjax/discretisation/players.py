@@ -57,6 +57,7 @@ class Player:
       products: the pairs of inputs, the smaller index first, whose product the cost may contain.
       fastest_at_ends: True if the largest rate of leaving a node is attained at the ends of the set.
       effort: the weight of one evaluation of H when deciding what to write out.
+      switches: True if the rates of changes of the mode depend on its inputs.
     """
 
     admissible: AdmissibleSet | None
@@ -70,6 +71,7 @@ class Player:
     products: frozenset[tuple[int, ...]]
     fastest_at_ends: bool
     effort: int
+    switches: bool = False
 
     def derivative(self, problem: Problem, function: Callable, j: int) -> Callable:
         """∂/∂u_j of a function of the problem's arguments, as a function of one state without unneeded axes."""
@@ -164,7 +166,9 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     inputs = found.control if sign > 0 else found.disturbance
     driven = tuple(drift.driven_by([j]) for j in inputs)
     curved = tuple(cost.has_square([j]) for j in inputs)
-    affine = drift.affine_in(inputs) and noise.free_of(inputs)  # then the rate of leaving a node is convex
+    affine = (
+        drift.affine_in(inputs) and found.switching.affine_in(inputs) and noise.free_of(inputs)
+    )  # then the rate of leaving a node is convex
     at_ends = affine or isinstance(admissible, (Finite, type(None)))
     suits = affine and cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball))
     products = frozenset(tuple(j - inputs.start for j in pair) for pair in cost.products_in(inputs))
@@ -184,7 +188,18 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     cells = tuple(branches ** len(shared(driven, group)) for group in groups)
     suits &= all(count <= PROGRAMS for count, program in zip(cells, programs, strict=True) if program)
     return Player(
-        admissible, sign, suits, driven, groups, cells, programs, curved, products, at_ends, _effort(found.operations)
+        admissible,
+        sign,
+        suits,
+        driven,
+        groups,
+        cells,
+        programs,
+        curved,
+        products,
+        at_ends,
+        _effort(found.operations),
+        not found.switching.free_of(inputs),
     )
 
 

@@ -1,7 +1,8 @@
-"""Decorators of public functions, for problems whose bounds or discount are functions of the state.
+"""Decorators of public functions, for problems with modes, and with bounds or a discount that depend on the state.
 
-The solvers support fixed sets of controls and constant discounts. A decorated function receives such a problem instead
-of the user's. In the solutions that it returns, the controls and the problem are the user's again.
+The solvers support fixed sets of controls and constant discounts, and modes as the first entry of the state. A
+decorated function receives such a problem, and its grid, instead of the user's. In the solutions that it returns, the
+controls and the problem are the user's again. The grid keeps its axis of modes.
 """
 
 import inspect
@@ -16,6 +17,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem.arguments import with_calls_by_name
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.mode_axis import in_mode, of_mode, over_modes, with_modes, without_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, cast, is_traced
 from hjbjax.problem.rewards import costs_of
@@ -34,7 +36,8 @@ T = TypeVar("T")
 def without_horizon(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function of (problem or problems, grid, ...) without a horizon.
 
-    Problems with a constant discount, and with a fixed set of controls or no control, pass through unchanged.
+    Problems without modes, with a constant discount, and with a fixed set of controls or no control, pass through
+    unchanged.
     """
     return _posing(function, _in_own_time)
 
@@ -47,17 +50,21 @@ def with_horizon(function: Callable[P, T]) -> Callable[P, T]:
 def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str], Problem]) -> Callable[P, T]:
     """Decorate a public function; ``discounting`` makes the discount of each problem constant."""
     first, second = list(inspect.signature(function).parameters)[:2]
+    name = function.__name__
 
     def posed(problem: Problem, grid: Grid) -> Problem:
-        return discounting(_with_fixed_set(problem, grid, function.__name__), grid, function.__name__)
+        return discounting(_with_fixed_set(problem, grid, name), grid, name)
 
     def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
         asked, grid = given[first], given[second]
         problems = [asked] if isinstance(asked, Problem) else asked if isinstance(asked, list) else []
-        if not any(map(_depends_on_state, problems)):
+        if not any(map(_needs_posing, problems)):
             return function(**given)
         if isinstance(grid, Grid):
-            made = [posed(each, grid) if _depends_on_state(each) else each for each in problems]
+            n = without_modes(grid).ndim
+            joined = [over_checked_modes(costs_of(each), n) if _has_modes(each) else each for each in problems]
+            given[second] = grid = _grid_of_all(grid, problems, name)
+            made = [posed(each, grid) if _needs_posing(each) else each for each in joined]
             given[first] = made[0] if isinstance(asked, Problem) else made
         try:
             found = function(**given)
@@ -71,9 +78,50 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
     return with_calls_by_name(function, call)
 
 
-def _depends_on_state(problem: object) -> bool:
-    """True for a problem whose bounds or discount are functions of the state."""
-    return isinstance(problem, Problem) and (callable(problem.discount) or callable(problem.controls))
+def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorator of a public function of (problem, grid, ...): a problem with modes gets the mode as its first state.
+
+    The function also receives the grid with an axis of modes. Problems without modes pass through unchanged.
+
+    Args:
+      *of_state: names of arguments that are functions of the state, which the user writes with the mode last.
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        first, second = list(inspect.signature(function).parameters)[:2]
+
+        def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
+            problem, grid = given[first], given[second]
+            if _has_modes(problem) and isinstance(grid, Grid):
+                given[first] = over_checked_modes(costs_of(problem), without_modes(grid).ndim)
+                given[second] = with_modes(grid, problem.modes.names)
+                given |= {name: of_mode(given[name], problem.modes) for name in of_state if name in given}
+            return function(**given)
+
+        return with_calls_by_name(function, call)
+
+    return decorate
+
+
+def _needs_posing(problem: object) -> bool:
+    """True for a problem with modes, or whose bounds or discount are functions of the state."""
+    if not isinstance(problem, Problem):
+        return False
+    return _has_modes(problem) or callable(problem.discount) or callable(problem.controls)
+
+
+def _has_modes(problem: object) -> bool:
+    """True for a problem with modes."""
+    return isinstance(problem, Problem) and problem.modes is not None
+
+
+def _grid_of_all(grid: Grid, problems: list[Problem], name: str) -> Grid:
+    """The grid with the modes of the problems, which must be the same."""
+    found = {() if each.modes is None else each.modes.names for each in problems if isinstance(each, Problem)}
+    if len(found) > 1:
+        raise ValueError(f"{name}: got problems with the modes {sorted(found)}; wanted the same modes in all of them")
+    (names,) = found
+    return with_modes(grid, names) if names else grid
 
 
 def _of_user(found: Any, problem: Problem) -> Any:
@@ -82,7 +130,7 @@ def _of_user(found: Any, problem: Problem) -> Any:
         return found
     changed: dict[str, Any] = {} if found.problem is None else {"problem": problem}
     if callable(problem.controls) and found.policy is not None:
-        bounds = _bounds(problem, found.grid, found.times)
+        bounds = _bounds(over_modes(problem, without_modes(found.grid).ndim), found.grid, found.times)
         policy = control_of(bounds, found.policy)
         changed["policy"] = policy.astype(found.policy.dtype)
     return altered(found, **changed)
@@ -189,3 +237,34 @@ def _least(on: Discretisation) -> tuple[Scalar, Scalar, Scalar]:
     faulty = ~((rate > 0) & (rate < jnp.inf))
     where = jnp.argmax(faulty)
     return rate.reshape(-1)[where], where, jnp.sum(faulty)
+
+
+# --- modes ---
+
+
+def over_checked_modes(problem: Problem, n: int) -> Problem:
+    """The problem whose state begins with the mode, after checks of its functions in every mode on one state.
+
+    Raises:
+      ValueError: a function of the wrong shape in some mode.
+    """
+    modes = problem.modes
+    if modes is None:
+        return problem
+    for number, name in enumerate(modes.names):
+        try:
+            one = with_any_control(in_mode(problem, number), n)
+            checks.of_one_state(one, n, "the number of axes of the grid")
+        except ValueError as error:
+            raise ValueError(f"in mode {name!r}: {error}") from error
+    sizes = {
+        "x": (n,),
+        "u": (one.controls.dim if one.controls else 0,),
+        "d": (getattr(problem.disturbances, "dim", 0),),
+    }
+    letters = {"rates": problem.arguments("x", "u", "d", "t"), "switching_cost": problem.state_arguments("x", "t")}
+    for name, names in letters.items():
+        if callable(table := getattr(modes, name)):
+            shapes = {letter: sizes.get(letter, ()) for letter in names}
+            checks.function_of(table, f"Modes.{name}: {name}", (len(modes.names),) * 2, **shapes)
+    return over_modes(problem, n)

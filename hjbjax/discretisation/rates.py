@@ -39,7 +39,7 @@ class Rates:
     """The matrix-free generator of the chain under a policy: (𝓛V)(x) = Σ_o c_o(x) (V(x + o) − V(x)).
 
     Args:
-      offsets: the jumps o, each a tuple of −1, 0, 1, one entry per axis.
+      offsets: the jumps o, each a tuple of −1, 0, 1, one entry per axis; along an axis of modes up to k − 1.
       values: for each offset the rates c_o ≥ 0 per unit time, shape (*grid); none leads out of the box.
       one_way: True if at most one of two opposite jumps has a positive rate, as without noise.
     """
@@ -87,15 +87,18 @@ def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
     for other in others:  # jumps of either chain
         for offset, rate in _table(on, other, {}).items():
             table[offset] = table[offset] + rate
+    for number, rate in enumerate(on.mode_rates(u, d, x), start=1):
+        table[stencil.unit(grid, 0, number)] = rate
     values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
     return Rates(tuple(table), values, one_way=on.problem.noise is None and on.scheme.chain.one_way and not others)
 
 
 def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[Offset, Any]:
     """The rate of every jump for drift f and diffusion a."""
-    grid = on.grid
+    grid, links = on.grid, on.chain.links
     table: dict[Offset, Any] = {}
-    for axis, link in enumerate(on.chain.links):
+    for axis in grid.state_axes:
+        link = links[axis]
         left = stencil.noise_along(a, grid, axis)
         upward, downward = schemes.weights(on.scheme.chain, f[axis], left, link, grid, axis)
         for step, weight, length in ((1, upward, link.up), (-1, downward, link.down)):
@@ -134,7 +137,8 @@ def fastest_rate(on: Discretisation) -> jax.Array:
         mine = (_table(on, on.drifts(u, ds[0])[0], on.diffusion(u, ds[0])) for u in us)
         theirs = (_table(on, on.drifts(us[0], d)[1], {}) for d in ds)
         tables = ([sum(table.values()) for table in each] for each in (mine, theirs))
-        return result + sum(functools.reduce(jnp.maximum, totals) for totals in tables)
+        switching = [sum(on.mode_rates(u, d), start=result) for u, d in itertools.product(us, ds)]
+        return functools.reduce(jnp.maximum, switching) + sum(functools.reduce(jnp.maximum, each) for each in tables)
     for u, d in itertools.product(us, ds):
         result = jnp.maximum(result, jump_rates(on, u, d).total())
     return result

@@ -246,7 +246,7 @@ class Limited(Scheme):
 
         found = []
         for axis, (pair, link) in enumerate(pairs):
-            if grid.shape[axis] == 2:  # no second difference
+            if grid.shape[axis] == 2 or axis not in grid.state_axes:  # no second difference
                 found.append(pair)
                 continue
             if link.meets_up is link.meets_down is None and _is_plain(grid, axis):
@@ -319,7 +319,8 @@ class Weno5(Scheme):
         grid, noisy = around.grid, around.reflecting
         found = slopes.weno5(around.value, grid, around.unreachable, noisy)
         for axis, (pair, link) in enumerate(zip(around.one_sided, around.links, strict=True)):
-            if (broken := slopes.broken_stencils(link, grid, axis, around.unreachable)) is not None:
+            broken = slopes.broken_stencils(link, grid, axis, around.unreachable) if axis in grid.state_axes else None
+            if broken is not None:
                 near, (up, down) = stencil.limited(*pair, grid, axis, link, noisy[axis]), found[axis]
                 found[axis] = jnp.where(broken, near[0], up), jnp.where(broken, near[1], down)
         return found

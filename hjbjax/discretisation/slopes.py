@@ -37,7 +37,13 @@ EPSILON = 1e-6  # relative to the typical squared slope: differences in smoothne
 
 def eno2(values: Field, grid: Grid, noisy: Noisy | None = None) -> list[tuple[Field, Field]]:
     """The slopes from above and from below along every axis, each of shape (*grid); zero across a wall."""
-    return [of_second_order(values, grid, axis, _smaller, noisy) for axis in range(grid.ndim)]
+    return along_states(grid, lambda axis: of_second_order(values, grid, axis, _smaller, noisy))
+
+
+def along_states(grid: Grid, slopes: Callable[[int], tuple[Field, Field]]) -> list[tuple[Field, Field]]:
+    """The slopes along every axis of the state; zero along an axis of modes, where nothing moves."""
+    zero = jnp.zeros(())
+    return [slopes(axis) if axis in grid.state_axes else (zero, zero) for axis in range(grid.ndim)]
 
 
 def of_second_order(
@@ -63,14 +69,15 @@ def weno5(values: Field, grid: Grid, lost: Mask | None = None, noisy: Noisy | No
     # it only sets the unit of ε, so no derivative should pass through the nodes of the largest and the least V
     extent = jax.lax.stop_gradient(grid.layout.largest(most) - grid.layout.least(least))
     extent = jnp.where(extent > 0, extent, 1)  # a constant V has slopes zero in any unit
-    result = []
-    for axis in range(grid.ndim):
+
+    def slopes(axis: int) -> tuple[Field, Field]:
         typical = extent / (grid.hi[axis] - grid.lo[axis])
         steps = _differences(values, grid, axis, 3, 1 / (grid.spacing(axis) * typical), noisy)
         # six differences: the last five from above are the mirror image of the first five from below
         above, below = typical * _weighted(*steps[:0:-1]), typical * _weighted(*steps[:-1])
-        result.append(stencil.stopped(above, below, grid, axis))
-    return result
+        return stencil.stopped(above, below, grid, axis)
+
+    return along_states(grid, slopes)
 
 
 def broken_stencils(link: Links, grid: Grid, axis: int, lost: Mask | None = None) -> AtNodes | None:

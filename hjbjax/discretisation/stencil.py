@@ -117,7 +117,7 @@ def continued(
     Args:
       values: V, or a change of V.
       grid: the grid.
-      offset: one step −1, 0 or 1 per axis.
+      offset: one step −1, 0 or 1 per axis; along an axis of modes any number.
       mirror: beyond a wall use the mirror image, as noise requires; otherwise as in ``neighbour``.
       change: ``values`` are a change of V, so a prescribed slope adds nothing.
     """
@@ -208,11 +208,14 @@ def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bo
     Args:
       values: node values, shape (*grid).
       grid: the grid.
-      offset: steps along the axes, each −1, 0 or 1.
+      offset: steps along the axes, each −1, 0 or 1; along an axis of modes any number.
       ghost: beyond an edge use the edge node's value; otherwise zero.
     """
     for axis, step in enumerate(offset):
         if step == 0:
+            continue
+        if axis not in grid.state_axes:
+            values = jnp.roll(values, -step, axis)
             continue
         last = slices(values, grid, axis, step)
         outside = beyond(values, grid, axis, step, last if ghost else jnp.zeros_like(last))

@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, are_finite, bridging, meeting_flag, onto_edge
+from hjbjax.feedback.mode_changes import after_changes
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.payments import is_tube
 from hjbjax.hamiltonian.derivatives import with_both_modes
@@ -51,6 +52,7 @@ LEAST_STEPS = 10  # per output interval with noise, where no error estimate shor
 TREE = 64  # the shortest step over the tolerance of the Brownian tree, below which w is interpolated
 DEEPEST = 2**30  # the largest duration over that tolerance: each halving adds a level of the tree to every step
 CHECKPOINTS = 8  # per interval in reverse mode: its steps are computed twice, and three times from 45 steps on
+CHANGE = -1  # the code of an interval that ends where the mode changes, after which the path goes on
 BRACKET = 4  # units in the last place: the width of the bracket around the time at which a path meets a boundary
 
 
@@ -102,6 +104,11 @@ def integrate(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Path, jax.A
 
 def _integrated(given: tuple[InitialValueProblem, Stepping], reverse: bool) -> tuple[Path, jax.Array]:
     """The path of full length and its mask, computed by a program for forward or for reverse mode."""
+    if reverse and given[0].loop.modes:
+        raise ValueError(
+            "simulate: a path with changes of the mode has no derivative in reverse mode, as the number of changes is "
+            "not known beforehand; use forward mode, such as jax.jvp or jax.jacfwd"
+        )
     interval, first = _intervals(*given, reverse)
     interval = jax.checkpoint(interval, prevent_cse=False) if reverse else interval
     last, rows = jax.lax.scan(interval, first, given[0].times[1:])
@@ -161,7 +168,7 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
         code = jnp.where((code == PathStatus.DURATION) & ~are_finite((u, d)), PathStatus.UNDEFINED, code)
         active = code == PathStatus.DURATION  # the status of a path that has not ended yet
         times = (t, jnp.where(active, end, t), ivp.times[-1])
-        later, moved, result, made, seen = _advance(loop, stepping, solve, times, y, u)
+        later, moved, result, made, seen = _through_changes(loop, stepping, solve, (start, *times), y, u)
         count = count + made
         code = jnp.where(active, result, code)
         code = jnp.where((code == PathStatus.DURATION) & (count >= stepping.max_steps), PathStatus.MAX_STEPS, code)
@@ -179,7 +186,9 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
     extremes = jnp.asarray([jnp.inf, -jnp.inf], x0.dtype)
     if is_tube(loop.problem):
         extremes = _extremes(loop, start, (start[None], x0[None]), extremes)
-    return interval, (start, jnp.append(x0, 0.0), code, jnp.zeros((), jnp.int32), extremes)
+    y = jnp.append(x0, 0.0)
+    y = after_changes(loop, start, y, start) if loop.modes else y
+    return interval, (start, y, code, jnp.zeros((), jnp.int32), extremes)
 
 
 def _extremes(loop: Loop, start: Number, seen: tuple[Array, Array], before: jax.Array) -> jax.Array:
@@ -212,6 +221,8 @@ def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: R
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count, extremes), (later, states, controls, disturbances, active) = last, shown
     hit, ended = code == PathStatus.TARGET, code == PathStatus.DURATION
+    if loop.modes:  # the mode may change at once
+        x0 = after_changes(loop, start, jnp.append(x0, 0.0), start)[:-1]
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
     # a path that leaves the box or fails pays nothing at its end
     due = jnp.where(hit, loop.paid_at_end(t, y[:-1]), loop.paid_at_last(t, y[:-1]))
@@ -230,6 +241,29 @@ def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: R
 def _has_last_payment(loop: Loop) -> bool:
     """True if there is a payment after the last time, even if it is zero."""
     return loop.due == "V at the horizon" or (loop.due == "terminal cost" and loop.problem.terminal_cost is not None)
+
+
+def _through_changes(
+    loop: Loop, stepping: Stepping, solve: Callable, times: tuple[jax.Array, ...], y: jax.Array, u: Control
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
+    """``_advance`` through all changes of the mode in an interval; the first of the ``times`` is that of the path."""
+    start, t, end, last = times
+    if not loop.modes:
+        return _advance(loop, stepping, solve, (t, end, last), y, u)
+
+    def on(carry: tuple) -> tuple:
+        t, y, _, made, _ = carry
+        now = u if stepping.held else loop.players(t, y[:-1])[0]
+        t, y, code, more, seen = _advance(loop, stepping, solve, (t, end, last), y, now)
+        y = jnp.where(code == CHANGE, after_changes(loop, t, y, start), y)
+        return t, y, code.astype(jnp.int32), made + more, seen
+
+    def changes(carry: tuple) -> jax.Array:
+        return (carry[2] == CHANGE) & (carry[3] < stepping.max_steps)
+
+    none = jnp.asarray(CHANGE, jnp.int32), jnp.zeros((), jnp.int32), (t[None], y[None, :-1])
+    t, y, code, made, seen = jax.lax.while_loop(changes, on, (t, y, *none))
+    return t, y, jnp.where(code == CHANGE, PathStatus.MAX_STEPS, code), made, seen
 
 
 def _advance(
@@ -263,8 +297,11 @@ def _advance(
     target, margin = loop.target(later, y[:-1]), loop.margin(y[:-1])
     # the codes are written from the weakest reason to the strongest; each `where` overrides the earlier ones
     code = jnp.where(met | (target <= margin), PathStatus.TARGET, PathStatus.LEFT_BOX)
+    if loop.modes:
+        first = loop.until_change(later, y[:-1]) <= jnp.minimum(target, margin)
+        code = jnp.where(first & ~met, CHANGE, code)
     if loop.guarded and not stepping.held:
-        inside = (target > 0) & (margin > 0)
+        inside = (target > 0) & (margin > 0) & (code != CHANGE)
         code = jnp.where(inside & ~met & ~are_finite(loop.players(later, y[:-1])), PathStatus.UNDEFINED, code)
     code = jnp.where(diffrax.is_event(solved.result), code, PathStatus.DURATION)
     code = jnp.where(jnp.all(jnp.isfinite(y)), code, PathStatus.NONFINITE)
@@ -309,6 +346,8 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
 
     def margin(t: Number, y: Array, args: Beginning, **kwargs: object) -> jax.Array:
         inside = jnp.minimum(loop.target(t, y[:n]), loop.margin(y[:n]))
+        if loop.modes:
+            inside = jnp.minimum(inside, loop.until_change(t, y[:n]))
         if loop.guarded and not stepping.held:  # under a hold the players are only evaluated at the samples
             inside = jnp.where(are_finite(loop.players(t, y[:n])), inside, jnp.minimum(inside, -1))
         return jnp.where(y[-1] < 1, y[-1], inside) if bridged else inside  # below 1 if the step meets the target
@@ -331,7 +370,7 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
         kind, controller = diffrax.SRA1 if additive else diffrax.Euler, diffrax.ConstantStepSize()
         solver = bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
     event = None
-    ends = loop.guarded or loop.ends or (loop.grid is not None and not loop.clamp)
+    ends = loop.modes or loop.guarded or loop.ends or (loop.grid is not None and not loop.clamp)
     if ends:  # an event doubles the compile time
         close = BRACKET * jnp.finfo(x0.dtype).eps
         # flip=True: the function falls through zero; "detect" would put a host callback into the compiled program

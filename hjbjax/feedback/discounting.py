@@ -12,15 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.loop import Loop
+from hjbjax.feedback.loop import Loop, with_entry
 from hjbjax.feedback.path import Path
-from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 
-BEYOND = 1e30  # an end of the box that z never reaches
-PAYMENTS = ("cost", "exit_cost", "terminal_cost", "stopping_cost")
+PAYMENTS = ("cost", "exit_cost", "terminal_cost", "stopping_cost", "switching_costs")
+UNPAID = ("target", "mode_rates")  # functions that are no payments
 
 
 @pytree_dataclass(static=("name",))
@@ -44,7 +43,7 @@ class Weighted:
             return jnp.pad(sigma, ((0, 1), (0, 0)))
         ingredient = getattr(problem, self.name)
         found = ingredient(*own) if callable(ingredient) else ingredient
-        return found if self.name == "target" else jnp.exp(-z) * jnp.asarray(found, x.dtype)
+        return found if self.name in UNPAID else jnp.exp(-z) * jnp.asarray(found, x.dtype)
 
 
 def with_integral(loop: Loop, x0: Any) -> tuple[Loop, Any]:
@@ -52,22 +51,15 @@ def with_integral(loop: Loop, x0: Any) -> tuple[Loop, Any]:
     problem = loop.problem
     if not callable(problem.discount):
         return loop, x0
-    names = ["drift", *(name for name in ("target", *PAYMENTS) if getattr(problem, name) is not None)]
+    names = ["drift", *(name for name in (*UNPAID, *PAYMENTS) if getattr(problem, name) is not None)]
     changed: dict[str, Any] = {name: as_partial(Weighted(problem, name)) for name in names}
     if callable(problem.noise):
         changed["noise"] = as_partial(Weighted(problem, "noise"))
     elif problem.noise is not None:  # a matrix keeps the higher order of the integrator for additive noise
         changed["noise"] = jnp.pad(problem.diffusion(jnp.zeros(np.shape(x0)), jnp.zeros(0)), ((0, 1), (0, 0)))
-    grid = loop.grid
-    if grid is not None:
-        lo, hi = jnp.append(jnp.asarray(grid.lo), -BEYOND), jnp.append(jnp.asarray(grid.hi), BEYOND)
-        grid = Grid(lo, hi, (*grid.shape, 2), (*grid.periodic, False))
-    seen: dict[str, Any] = {name: _of_x(getattr(loop, name)) for name in ("control", "opponent", "surplus")}
+    longer, start = with_entry(loop, altered(problem, discount=0.0, discounted=False, **changed), x0, 0.0)
     last = None if loop.at_horizon is None else jax.tree_util.Partial(_weighted_look, as_partial(loop.at_horizon))
-    whole = altered(problem, discount=0.0, discounted=False, **changed)
-    longer = dataclasses.replace(loop, problem=whole, grid=grid, at_horizon=last, **seen)
-    xp: Any = np if isinstance(x0, np.ndarray) else jnp
-    return longer, xp.append(x0, xp.zeros((), x0.dtype))
+    return dataclasses.replace(longer, at_horizon=last), start
 
 
 def without_integral(path: Path, problem: Problem) -> tuple[Path, Any]:
@@ -77,15 +69,6 @@ def without_integral(path: Path, problem: Problem) -> tuple[Path, Any]:
         return path, np.exp(-np.asarray(problem.discount) * times) if isinstance(times, np.ndarray) else None
     z = path.states[:, -1]
     return dataclasses.replace(path, states=path.states[:, :-1]), np.exp(-z) if isinstance(z, np.ndarray) else None
-
-
-def _of_x(function: Callable | None) -> jax.tree_util.Partial | None:
-    """A function of (t, x) as a function of (t, (x, z))."""
-    return None if function is None else jax.tree_util.Partial(_look, as_partial(function))
-
-
-def _look(function: Callable, t: Number, y: State) -> Array:
-    return function(t, y[:-1])
 
 
 def _weighted_look(function: Callable, t: Number, y: State) -> Array:

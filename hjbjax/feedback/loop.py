@@ -13,6 +13,7 @@ order 1 of the Euler scheme. If the noise acts only along the boundary (∇l'σ 
 a target in position), the path has a slope, and the interpolant of the step locates the target.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
@@ -24,8 +25,8 @@ import numpy as np
 from hjbjax.feedback.feedback import is_grid_feedback
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, pytree_dataclass
+from hjbjax.problem.problem import Problem, is_random
+from hjbjax.problem.pytree import altered, as_partial, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Disturbance, Key, Number, State
 from hjbjax.tracing import checks, closures
 
@@ -33,12 +34,13 @@ Event: TypeAlias = tuple[Number, State]  # a point of the path: its time and its
 Actions: TypeAlias = tuple[Control, Disturbance | None]  # of both players; no disturbance without an opponent
 
 HALVINGS = 30  # of the path back to the last point at which the players are defined: a billionth of an interval
+BEYOND = 1e30  # an end of the box that an entry of the state never reaches
 STREAM = 0x6272  # folded into the key, so that the draws are independent of the Brownian path, which splits the key
 NEWTON = 3  # steps onto the boundary of the target, whose function need not be linear
 EDGE = 1e-6  # the smallest share of a step before or after a meeting; shares of 0 and 1 would give no zero inside it
 
 
-@pytree_dataclass(static=("clamp", "due"))
+@pytree_dataclass(static=("clamp", "due", "modes", "clock"))
 class Loop:
     """The closed loop as functions of (t, x).
 
@@ -51,6 +53,10 @@ class Loop:
       surplus: ψ − V as a function of (t, x), zero where the path is stopped; None if V stops no path.
       due: the payment after the last time: "terminal cost", "V at the horizon", or "nothing" for a shortened path.
       at_horizon: V at the horizon as a function of (t, x), if the problem does not define it.
+      switch: min_j (c_ij + V_j) − V_i and its terms as a function of (t, x); None if V changes no mode.
+      modes: the number of modes; zero without modes. See ``mode_changes``.
+      clock: the position of the clock in the state, which is zero when the mode changes at random.
+      key: the key of the random changes.
     """
 
     problem: Problem
@@ -61,6 +67,10 @@ class Loop:
     surplus: Callable | None = None
     due: str = "terminal cost"
     at_horizon: Callable | None = None
+    switch: Callable | None = None
+    modes: int = 0
+    clock: int = 0
+    key: Key | None = None
 
     def wrap(self, x: State) -> State:
         """The state with its periodic entries wrapped into the box."""
@@ -148,6 +158,13 @@ class Loop:
         level = self.number(jnp.inf if self.problem.target is None else self.problem.target, t, x)
         return level if self.surplus is None else jnp.minimum(level, self.surplus(t, self.wrap(x)))
 
+    def until_change(self, t: Number, x: State) -> jax.Array:
+        """A function ≤ 0 where the mode changes; inf without modes."""
+        left = jnp.asarray(jnp.inf, x.dtype)
+        if self.modes and self.problem.mode_rates is not None:
+            left = x[self.clock]
+        return left if self.switch is None else jnp.minimum(left, self.switch(t, self.wrap(x))[0])
+
     def margin(self, x: State) -> jax.Array:
         """The distance to the boundary of the box over its width, ≤ 0 outside; inf if the path is not limited."""
         if self.grid is None or self.clamp:
@@ -189,6 +206,37 @@ class Loop:
             final = problem.running_max if problem.stopping_cost is None else problem.stopping_cost
         paid = self.number(final, t, x)
         return paid if problem.stopping_cost is None else jnp.minimum(paid, self.number(problem.stopping_cost, t, x))
+
+
+def with_entry(loop: Loop, problem: Problem, x0: Any, first: Number) -> tuple[Loop, Any]:
+    """The loop of a problem with one more entry of the state, without bounds, and its start.
+
+    The players and the other functions of (t, x) do not see the last entry.
+
+    Args:
+      loop: the loop.
+      problem: the problem with the longer state.
+      x0: the start of the loop.
+      first: the entry at the start.
+    """
+    grid = loop.grid
+    if grid is not None:
+        lo, hi = jnp.append(jnp.asarray(grid.lo), -BEYOND), jnp.append(jnp.asarray(grid.hi), BEYOND)
+        grid = Grid(lo, hi, (*grid.shape, 2), (*grid.periodic, False))
+    names = ("control", "opponent", "surplus", "at_horizon", "switch")
+    seen: dict[str, Any] = {name: _of_shorter(getattr(loop, name)) for name in names}
+    xp: Any = np if isinstance(x0, np.ndarray) and not isinstance(first, jax.Array) else jnp
+    start = xp.append(x0, xp.asarray(first, x0.dtype))
+    return dataclasses.replace(loop, problem=problem, grid=grid, **seen), start
+
+
+def _of_shorter(function: Callable | None) -> jax.tree_util.Partial | None:
+    """A function of (t, x) as a function of (t, (x, entry))."""
+    return None if function is None else jax.tree_util.Partial(_look, as_partial(function))
+
+
+def _look(function: Callable, t: Number, y: State) -> Array:
+    return function(t, y[:-1])
 
 
 def are_finite(actions: Actions) -> jax.Array:
@@ -245,9 +293,10 @@ def _array(function: Callable, name: str, letters: Sequence[str], *arguments: Ar
 
 def noise_key(problem: Problem, given: Key | int | None) -> Key | None:
     """The random key, from a key or a seed; refuses a key without noise, and noise without a key."""
-    if problem.noise is not None and given is None:
-        raise ValueError("simulate: the problem has noise; give key=jax.random.key(0), or any other seed")
-    if problem.noise is None and given is not None:
+    if is_random(problem) and given is None:
+        what = "noise" if problem.noise is not None else "random changes of the mode"
+        raise ValueError(f"simulate: the problem has {what}; give key=jax.random.key(0), or any other seed")
+    if not is_random(problem) and given is not None:
         raise ValueError("simulate: got a key, but problem.noise is None and nothing is random; leave out key")
     return None if given is None else arguments.random_key(given, "simulate: key")
 

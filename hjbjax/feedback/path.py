@@ -74,6 +74,7 @@ class Path:
         after the end of a short path, up to errors of the grid and the integrator.
       held: True if each control was constant through its interval, so that plots show steps.
       payoff: "cost" or "reward", the payments of the problem.
+      modes: shape (k+1,), the number of the mode at every time; None for a problem without modes.
     """
 
     times: Any  # NumPy arrays and numbers from `simulate`; JAX arrays from `rollout`, with more axes under vmap
@@ -88,6 +89,7 @@ class Path:
     promised: Any = None
     held: bool = False
     payoff: str = COST
+    modes: Any = None
 
     @property
     def reward(self) -> Any:

@@ -21,7 +21,7 @@ import numpy as np
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
-from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.problem import Problem, is_discounted, is_random
 from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import with_any_control
@@ -79,7 +79,7 @@ def is_tube(problem: Problem) -> bool:
     """
     if problem.running_max is not None:
         return True
-    return problem.stopping_cost is not None and problem.cost is None and problem.noise is None
+    return problem.stopping_cost is not None and problem.cost is None and not is_random(problem)
 
 
 def surplus(problem: Problem, feedback: object) -> Lookup | None:
@@ -210,7 +210,7 @@ def broken_promise(
     """
     solution = solution_of(feedback)
     # one noisy path says nothing about the mean cost
-    if path.promised is None or solution is None or problem.noise is not None:
+    if path.promised is None or solution is None or is_random(problem):
         return None
     states = path.states
     free = np.array(solution.grid.periodic)

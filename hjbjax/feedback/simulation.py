@@ -9,15 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.posing import over_checked_modes
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.discounting import with_integral, without_integral
 from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop, check_shapes, noise_key, settled_loop, timeless
+from hjbjax.feedback.mode_changes import (
+    grid_of_modes,
+    switching_surplus,
+    with_clock,
+    with_first_mode,
+    with_modes_apart,
+    without_clock,
+)
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
 from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
+from hjbjax.problem.mode_axis import of_mode
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced
 from hjbjax.problem.rewards import costs_of
@@ -43,6 +53,7 @@ def simulate(
     x0: Numbers | Sequence[float],
     duration: float,
     *,
+    mode: str | int | None = None,
     steps: int | None = None,
     disturbance: Callable | None = None,
     time_varying: bool = False,
@@ -75,10 +86,13 @@ def simulate(
       duration: the length of the path unless it reaches the target earlier, in units of time.
 
     Keyword Args:
+      mode: the mode at time 0, its name or its number, if and only if the problem has modes. Functions then take the
+        number of the mode last. The mode changes at random at the rates of the problem, and a Solution changes it where
+        that is optimal.
       steps: number of output intervals; ``None`` is 200, or the sampling intervals under ``hold``.
       disturbance: a function that returns the opponent's d, shape (l,). Default: the worst case of the Solution.
       time_varying: True if feedback and disturbance take ``(t, x)`` although the problem does not depend on time.
-      key: a JAX random key or an integer; required if and only if the problem has noise.
+      key: a JAX random key or an integer; required if and only if the problem has noise, or random changes of the mode.
       hold: the sampling interval of a zero-order hold of the control, in units of time; ``False`` for none.
       grid: the box of a feedback that is a function; a Solution has its own grid.
       clamp: outside the box, ``False`` ends the path at the boundary; ``True`` continues with the feedback at the
@@ -114,18 +128,21 @@ def simulate(
         )
     if not isinstance(problem, Problem):
         raise TypeError(f"simulate: got {type(problem).__name__}, wanted a Problem, and then its feedback")
-    problem = costs_of(problem)
+    problem, modes = costs_of(problem), problem.modes
     duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
     due = _due(feedback, duration)
     if _is_traced(problem, feedback, disturbance, x0, key, grid, rtol, atol, max_step):
-        options: Any = {"disturbance": disturbance, "time_varying": time_varying, "grid": grid, "clamp": clamp}
+        options: Any = {
+            "disturbance": disturbance, "time_varying": time_varying, "grid": grid, "clamp": clamp, "mode": mode,
+        }  # fmt: skip
         times, held = _times(duration, steps, None if hold is False else hold), hold is not None and hold is not False
         return rollout(
             problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=noise_key(problem, key), hold=held,
             rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, due=due, **options,
         )  # fmt: skip
+    problem, feedback, disturbance, grid = _over_modes(problem, feedback, disturbance, grid, np.size(x0))
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
-    start = _initial_state(x0, loop.grid)
+    start = _initial_state(with_first_mode(modes, x0, mode, "simulate"), loop.grid)
     loop = dataclasses.replace(loop, problem=with_any_control(problem, start.size))
     loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
     hold = None if hold is False else hold
@@ -152,16 +169,19 @@ def simulate(
                 f"simulate: x0 = {start.tolist()} is outside the box from {lo} to {hi}, where the feedback is not "
                 "known; start inside, or pass clamp=True"
             )
-        begun = InitialValueProblem(*with_integral(loop, start), times, key)
+        count = 0 if modes is None else len(modes.names)
+        begun = InitialValueProblem(*with_integral(*with_clock(loop, start, key, count)), times, key)
         path, active = _in_chunks(begun, stepping, clock)
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, loop.problem.controls))
         path, weights = without_integral(path, problem)
+        path = without_clock(path, count)
         path = dataclasses.replace(path, promised=_promised(problem, feedback, start), payoff=problem.payoff)
         path = truncate(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
         broken = broken_promise(
             problem, feedback, path, float(weights[len(path.times) - 1]),
             to_horizon=due == "V at the horizon", worst_case=disturbance is None,
         )  # fmt: skip
+        path = with_modes_apart(path, count)
         if broken is not None:
             warn(f"simulate: {broken}")
         if clock.interrupted:
@@ -204,6 +224,7 @@ def rollout(
     x0: Numbers | Sequence[float],
     times: Numbers | Sequence[float],
     *,
+    mode: str | int | None = None,
     disturbance: Callable | None = None,
     time_varying: bool = False,
     key: Key | None = None,
@@ -228,8 +249,9 @@ def rollout(
       times: output times, shape (k+1,), increasing; discounting starts at the first.
 
     Keyword Args:
+      mode: as in ``simulate``.
       disturbance: as in ``simulate``, like ``time_varying``.
-      key: a JAX random key; required if and only if the problem has noise.
+      key: a JAX random key; required if and only if the problem has noise, or random changes of the mode.
       hold: True if the control is held from one output time to the next.
       grid: as in ``simulate``, like ``clamp``, ``rtol``, ``atol``, ``max_step`` and ``max_steps``.
       due: the payment after the last time: "terminal cost", "V at the horizon" of a march, or "nothing". Default: the
@@ -255,7 +277,10 @@ def rollout(
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")
     key = noise_key(problem, key)
     # numbers that functions close over become leaves, because derivative rules only cover leaves
-    problem = settled(with_any_control(costs_of(problem), start.size), start.size, start.dtype)
+    modes = problem.modes
+    problem, feedback, disturbance, grid = _over_modes(costs_of(problem), feedback, disturbance, grid, start.size)
+    start = jnp.asarray(with_first_mode(modes, start, mode, "rollout"))
+    problem = settled(with_any_control(problem, start.size), start.size, start.dtype)
     if due is None:
         due = "V at the horizon" if _is_marched(feedback) else "terminal cost"
     loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
@@ -263,9 +288,26 @@ def rollout(
     loop = dataclasses.replace(loop, control=opened(loop.control, *moment), opponent=opened(loop.opponent, *moment))
     check_shapes(loop, start)
     stepping = Stepping(rtol, atol, np.inf if max_step is None else max_step, max_steps, hold)
-    begun = InitialValueProblem(*with_integral(loop, start), jnp.asarray(times, start.dtype), key)
+    count = 0 if modes is None else len(modes.names)
+    begun = InitialValueProblem(
+        *with_integral(*with_clock(loop, start, key, count)), jnp.asarray(times, start.dtype), key
+    )
     path, _ = without_integral(integrate(begun, stepping)[0], problem)
+    path = with_modes_apart(without_clock(path, count), count)
     return dataclasses.replace(path, payoff=problem.payoff)
+
+
+def _over_modes(
+    problem: Problem, feedback: Feedback, disturbance: Callable | None, grid: Grid | None, n: int
+) -> tuple[Problem, Feedback, Callable | None, Grid | None]:
+    """Everything for a state that begins with the mode; unchanged without modes."""
+    modes = problem.modes
+    if modes is None:
+        return problem, feedback, disturbance, grid
+    if problem.running_max is not None:
+        raise ValueError("simulate: got running_max and modes; the cost of such a path is not computed")
+    players = (of_mode(player, modes) for player in (feedback, disturbance))
+    return over_checked_modes(problem, n), *players, grid_of_modes(grid, modes)
 
 
 def _close(
@@ -311,7 +353,7 @@ def _close(
     control = None if problem.controls is None else as_partial(control)
     return Loop(
         problem, control, as_partial(opponent), grid, bool(clamp), surplus(problem, feedback), due,
-        value_at_horizon(feedback) if due == "V at the horizon" else None,
+        value_at_horizon(feedback) if due == "V at the horizon" else None, switching_surplus(problem, feedback),
     )  # fmt: skip
 
 

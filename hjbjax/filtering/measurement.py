@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import arguments, sets
+from hjbjax.problem.mode_axis import refuse_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, numbers, pytree_dataclass
 from hjbjax.problem.settings import own_settings
@@ -138,6 +139,7 @@ def plant(problem: Problem, n: int, name: str) -> Problem:
         raise TypeError(
             f"{name}: got {type(problem).__name__} for the plant, wanted a Problem: Problem(drift, noise=...)"
         )
+    refuse_modes(problem)
     if problem.time_dependent:
         raise ValueError(
             f"{name}: got time_dependent=True, wanted a plant whose functions take (x, u): an observer does not know "

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import edges, schemes, stencil
 from hjbjax.discretisation.discretisation import Differences, Discretisation
+from hjbjax.discretisation.slopes import along_states as slopes_along
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import tie
@@ -35,6 +36,7 @@ class DiscreteHamiltonian:
       value: V at the nodes.
       up, down: the slopes used by the drift: D⁺ and D⁻, or the slopes of a scheme of higher order.
       links: the distances to the neighbours along every axis.
+      gaps: the values of V after a change of the mode by 1, ..., k − 1, minus V; empty without random changes.
       bends: D⁺ − D⁻ along every axis, used by the noise, with the mirror image across a wall.
       tried: an action of each player that is a candidate in addition to the samples. With the actions of the last step
         as candidates a sampled policy never gets worse.
@@ -51,6 +53,7 @@ class DiscreteHamiltonian:
     down: tuple[jax.Array, ...]
     bends: tuple[jax.Array, ...]
     links: tuple[stencil.Links, ...]
+    gaps: tuple[jax.Array, ...] = ()
     tried: tuple[Action, Action] | None = None
     slack: tuple[Any, ...] | None = None
     lost: tuple[tuple[Any, Any], ...] | None = None
@@ -101,13 +104,15 @@ class DiscreteHamiltonian:
         first, *others = self.on.drifts(u, d, self.x)
         total = self.on.running_cost(u, d, self.x)
         # one axis after the other, so that XLA fuses all of H into one pass over V
-        for axis in range(grid.ndim):
+        for axis in grid.state_axes:
             total = total + self.gain(axis, first[axis], stencil.noise_along(a, grid, axis))
             for other in others:
                 total = total + self.gain(axis, other[axis], None)
         for (i, j), entry in a.items():
             if i != j:
                 total = total + self._diagonal(i, j, entry)
+        for rate, gap in zip(self.on.mode_rates(u, d, self.x) if self.gaps else [], self.gaps, strict=True):
+            total = total + rate * gap
         return jnp.broadcast_to(total, grid.shape)
 
     def _diagonal(self, i: int, j: int, entry: Any) -> Any:
@@ -136,7 +141,7 @@ def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
     hamiltonian = around(on, jnp.zeros(on.grid.shape, slopes.dtype))
     one = jnp.ones(on.grid.shape, slopes.dtype)
     ups, downs, bends = (tuple(sign * slope * one for slope in slopes) for sign in (1, -1, 2))
-    return dataclasses.replace(hamiltonian, up=ups, down=downs, bends=bends)
+    return dataclasses.replace(hamiltonian, up=ups, down=downs, bends=bends, gaps=())
 
 
 def around(
@@ -150,8 +155,10 @@ def around(
     # otherwise XLA hoists products of coordinates out of the loop, one array of all nodes per action
     x, value = tie((on.coordinates(), value))
     links = on.links
-    differences = tuple(stencil.one_sided(value, grid, axis, link) for axis, link in enumerate(links))
+    differences = tuple(slopes_along(grid, lambda axis: stencil.one_sided(value, grid, axis, links[axis])))
     bends = tuple(stencil.bends(*pair, grid, axis) for axis, pair in enumerate(differences))
+    jumps = range(1, len(grid.modes)) if on.problem.mode_rates is not None else ()
+    gaps = tuple(stencil.neighbour(value, grid, stencil.unit(grid, 0, number)) - value for number in jumps)
     slopes = on.scheme.slopes(Differences(on, x, value, links, differences, lost, first_order))
     if first_order is not None and not on.scheme.blends:
         choose = functools.partial(jnp.where, first_order)
@@ -165,4 +172,4 @@ def around(
     careful = lost is not None or grid.sides("constrained")
     slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)
-    return DiscreteHamiltonian(on, x, value, tuple(up), tuple(down), bends, links, slack=slack, lost=beside)
+    return DiscreteHamiltonian(on, x, value, tuple(up), tuple(down), bends, links, gaps, slack=slack, lost=beside)

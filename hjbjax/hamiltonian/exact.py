@@ -104,7 +104,13 @@ def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> _
         components.components(player.derivative(on.problem, on.problem.drift, j), *arguments, dtype=on.dtype)
         for j in range(count)
     ]
-    return _Part(hamiltonian, player, *_cost_coefficients(on, player, arguments), parts[number], slopes, noise)
+    linear, quadratic = _cost_coefficients(on, player, arguments)
+    if hamiltonian.gaps and player.switches:  # the gain of a change of the mode is affine in the inputs, like its rate
+        for j in range(count):
+            rates = player.derivative(on.problem, on.problem.mode_rates, j)
+            found = components.components(rates, *arguments, dtype=on.dtype)
+            linear[j] = linear[j] + _dot(list(found), hamiltonian.gaps)
+    return _Part(hamiltonian, player, linear, quadratic, parts[number], slopes, noise)
 
 
 def _in_ball(part: _Part) -> Action:

@@ -28,7 +28,7 @@ from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian import discrete, sensitivity
 from hjbjax.hamiltonian.derivatives import once
 from hjbjax.hamiltonian.search import Action
-from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation
+from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation, with_changes
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over, relaxed
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.problem.grid import Grid
@@ -77,17 +77,16 @@ class FixedPoint:
     lost: jax.Array | None = None
     arriving: Number | Field = 0.0
 
-    def residual(self, value: Field, actions: Actions, bound: jax.Array) -> Field:
-        """Φ at a value with fixed branches; ``bound`` marks the nodes at which a constraint may be active."""
+    def residual(self, value: Field, actions: Actions) -> Field:
+        """Φ at a value; where V equals a constraint, the constraint is the active branch."""
         on, obstacles = self.on, self.obstacles
         rate = discrete.around(on, value, self.lost).at(*actions) + self.arriving - on.decay * value
         outflow = jax.lax.stop_gradient(jump_rates(on, *actions).total() + on.decay)
         # divided like the equation, so that ∂Φ/∂V = −(I − W); the derivative of the divisor would be multiplied by r =
         # 0
         phi = jnp.where(obstacles.fixed, 0, rate) / jnp.where(outflow > 0, outflow, 1)
-        for constraint in (obstacles.upper, obstacles.lower):
-            if constraint is not None:
-                phi = jnp.where(bound & _is_constraint(value, constraint), constraint - value, phi)
+        for constraint in _constraints(obstacles, value):
+            phi = jnp.where(_is_constraint(value, constraint), constraint - value, phi)
         return jnp.where(obstacles.fixed, obstacles.fixed_value - value, phi)
 
 
@@ -135,18 +134,17 @@ def _solution_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
     value, question, policy, equation, evaluation = primals
     actions, grid = (list(policy.controls), list(policy.disturbances)), question.on.grid
     equation = _tied_to_constraints(equation, question.obstacles, value)
-    bound = equation.weights.total() == 0  # rows of active constraints have no weights
 
     def residual(question: FixedPoint) -> Field:
         moved = sensitivity.actions(question.on, value, question.lost, *actions)  # follows ends and kinks that move
-        return question.residual(value, moved, bound)
+        return question.residual(value, moved)
 
     operator: Map
     if question.on.scheme.monotone:
         operator = functools.partial(_chain_product, equation, grid)
         solvers = _chain_solvers(evaluation, equation, grid)
     else:
-        slope = jax.linearize(lambda at: question.residual(at, actions, bound), value)[1]
+        slope = jax.linearize(lambda at: question.residual(at, actions), value)[1]
         operator, solvers = lambda delta: -slope(delta), _high_order_solvers(equation, grid)
     right = jax.jvp(residual, (question,), (tangents[1],))[1]
     # a product, so that its transpose is NaN too
@@ -163,9 +161,8 @@ def _rests_unheld(question: FixedPoint, actions: Actions, value: Field) -> jax.A
     """
     on, obstacles = jax.lax.stop_gradient((question.on, question.obstacles))
     rests = (jump_rates(on, *actions).total() + on.decay <= 0) & ~obstacles.fixed
-    for constraint in (obstacles.upper, obstacles.lower):
-        if constraint is not None:
-            rests &= ~_is_constraint(value, constraint)
+    for constraint in _constraints(obstacles, value):
+        rests &= ~_is_constraint(value, constraint)
     return rests
 
 
@@ -264,18 +261,27 @@ def _tied_to_constraints(equation: PolicyEquation, obstacles: Obstacles, value: 
     has a derivative, since a policy may cycle there indefinitely.
     """
     free = jnp.ones(value.shape, bool)
-    for constraint in (obstacles.upper, obstacles.lower):
-        if constraint is not None:
-            free &= ~_is_constraint(value, constraint)
+    for constraint in _constraints(obstacles, value):
+        free &= ~_is_constraint(value, constraint)
     # a row without weights reads δ = s, the derivative of the constraint
-    return PolicyEquation(equation.source, equation.weights.scaled(jnp.where(free, 1, 0)), equation.fastest)
+    weights = equation.weights.scaled(jnp.where(free, 1, 0))
+    stops = ~free & ~obstacles.fixed
+    if obstacles.lower is not None:
+        stops &= ~_is_constraint(value, obstacles.lower)
+    return PolicyEquation(equation.source, with_changes(weights, obstacles, value, stops), equation.fastest)
+
+
+def _constraints(obstacles: Obstacles, value: Field) -> list[Field]:
+    """The bounds on V at the nodes, from above and then from below."""
+    return [each for each in (obstacles.ceiling(value), obstacles.lower) if each is not None]
 
 
 def _is_constraint(value: Field, constraint: Field) -> jax.Array:
     """The nodes where the value equals the constraint, up to rounding in a repeated evaluation of it."""
     # relative to both sizes, so that ψ = 0 must match exactly and units do not matter
     size = jnp.abs(value) + jnp.abs(constraint)
-    return jax.lax.stop_gradient(jnp.abs(value - constraint) <= 64 * jnp.finfo(value.dtype).eps * size)
+    near = jnp.abs(value - constraint) <= 64 * jnp.finfo(value.dtype).eps * size
+    return jax.lax.stop_gradient(near & jnp.isfinite(constraint))  # an infinite constraint never binds
 
 
 def refined(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:

@@ -13,6 +13,7 @@ w = 0 (or s = g − V). Every method solves this equation for the correction δ,
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from hjbjax.discretisation.rates import Rates, fastest_rate, jump_rates
 from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import Field, Nodes, Number, Scalar
+from hjbjax.problem.types import Field, Mask, Nodes, Number, Scalar
 
 LEAK = 64  # units of eps of Q: a smaller rate towards an unreachable node is rounding
 ROUNDING = 8  # units of eps in (Q + β)|V|: a smaller gain of one action over another is rounding
@@ -40,6 +41,7 @@ class Obstacles:
       lower: g at the nodes, or None.
       ended: bool (*grid), the fixed nodes that are targets, where no further action is taken.
       least_exit: the least exit cost on boundaries between the nodes, a number; zero if none is negative.
+      switching: the costs of changing the mode by 1, ..., k − 1, each (*grid); empty without such changes.
     """
 
     fixed: jax.Array
@@ -48,20 +50,34 @@ class Obstacles:
     lower: Field | None = None
     ended: jax.Array | bool = False
     least_exit: Number = 0.0
+    switching: tuple[Field, ...] = ()
+
+    def after_change(self, value: Nodes) -> list[Field]:
+        """The cost of changing the mode by 1, ..., k − 1 plus the value there, each (*grid)."""
+        return [cost + jnp.roll(value, -k, 0) for k, cost in enumerate(self.switching, start=1)]
+
+    def ceiling(self, value: Nodes) -> Field | None:
+        """The bound that stopping and a change of the mode put on V: min(ψ, c_ij + V_j); None without either."""
+        bounds = [*([] if self.upper is None else [self.upper]), *self.after_change(value)]
+        return functools.reduce(jnp.minimum, bounds) if bounds else None
 
     def impose(self, value: Field) -> Field:
         """``value`` with fixed values inserted and constraints imposed: max(g, min(ψ, V))."""
         # ψ before g: where g > ψ the running maximum takes precedence, as in the residual
         if self.upper is not None:
             value = jnp.minimum(value, self.upper)
+        if self.switching:
+            value = jnp.where(self.fixed, self.fixed_value, value)
+            for _ in self.switching:  # a shortest path of changes has at most k − 1 of them
+                value = functools.reduce(jnp.minimum, self.after_change(value), value)
         if self.lower is not None:
             value = jnp.maximum(value, self.lower)
         return jnp.where(self.fixed, self.fixed_value, value)
 
     def clipped(self, step: Field, value: Field) -> Field:
         """max(min(s, ψ − V), g − V) for a step s, and zero where V is fixed."""
-        if self.upper is not None:
-            step = jnp.minimum(step, self.upper - value)
+        if (ceiling := self.ceiling(value)) is not None:
+            step = jnp.minimum(step, ceiling - value)
         if self.lower is not None:
             step = jnp.maximum(step, self.lower - value)
         return jnp.where(self.fixed, 0, step)
@@ -69,8 +85,8 @@ class Obstacles:
     def acting(self, value: Nodes) -> jax.Array:
         """The nodes at which actions matter, bool (*grid): not fixed, and no constraint is the active branch."""
         acts = ~self.fixed  # where V = ψ the run stops, and where V = g the maximum is attained, so no action matters
-        if self.upper is not None:
-            acts &= value < self.upper
+        if (ceiling := self.ceiling(value)) is not None:
+            acts &= value < ceiling
         return acts if self.lower is None else acts & (value > self.lower)
 
 
@@ -115,7 +131,7 @@ def obstacles(on: Discretisation) -> Obstacles:
         edge = jnp.asarray(stencil.on_edge(on.grid, axis, step))
         given = jnp.where(edge & ~held, jnp.asarray(end.value, on.dtype), given)
         held = held | edge
-    return Obstacles(held, given, stop, floor, ended=held)
+    return Obstacles(held, given, stop, floor, ended=held, switching=tuple(on.switching_costs()))
 
 
 def greedy(
@@ -233,19 +249,40 @@ def policy_equation(
         outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))
     # s, then min(s, ψ − V), then max(·, g − V); a row whose branch is a constraint reads δ = source
     source, free = policy.defect / outflow, ~obstacles.fixed
-    if obstacles.upper is not None:
-        stops = free & (obstacles.upper - value < source)
-        source, free = jnp.where(stops, obstacles.upper - value, source), free & ~stops
+    stops: Any = False
+    if (ceiling := obstacles.ceiling(value)) is not None:
+        stops = free & (ceiling - value < source)
+        source, free = jnp.where(stops, ceiling - value, source), free & ~stops
     if obstacles.lower is not None:
         floored = ~obstacles.fixed & (obstacles.lower - value > source)
         source, free = jnp.where(floored, obstacles.lower - value, source), free & ~floored
+        stops = stops & ~floored if obstacles.switching else stops
     weights = rates.scaled(jnp.where(free, 1 / outflow, 0))
     if on.cuts_links:  # links to fixed nodes end on the boundary of the target, where the correction is zero
         loose = ~obstacles.fixed
         jumps = zip(weights.offsets, weights.values, strict=True)
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
         weights = dataclasses.replace(weights, values=cut)
+    weights = with_changes(weights, obstacles, value, stops)
     return PolicyEquation(source, weights, None if every_rate else fastest)
+
+
+def with_changes(weights: Rates, obstacles: Obstacles, value: Field, stops: Mask) -> Rates:
+    """The weights with a weight of one, to the best other mode, in the rows ``stops`` in which the mode is changed.
+
+    A change of the mode is a jump at no time: V_i = c_ij + V_j, so the row reads δ_i = s + δ_j.
+    """
+    if not obstacles.switching:
+        return weights
+    table, bounds = dict(zip(weights.offsets, weights.values, strict=True)), obstacles.after_change(value)
+    ceiling: Any = functools.reduce(jnp.minimum, bounds)
+    left = stops if obstacles.upper is None else stops & (ceiling < obstacles.upper)
+    for k, bound in enumerate(bounds, start=1):
+        offset = (k, *(0 for _ in value.shape[1:]))
+        goes = left & (bound <= ceiling)
+        table[offset] = table.get(offset, 0) + jnp.asarray(goes, value.dtype)
+        left = left & ~goes
+    return dataclasses.replace(weights, offsets=tuple(table), values=tuple(table.values()))
 
 
 def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) -> jax.Array:
@@ -263,7 +300,7 @@ def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) 
         leak = jnp.where(stencil.neighbour(~lost, grid, offset), 0, c)
         if on.problem.noise is None:  # jumps along one axis
             axis = next(axis for axis, step in enumerate(offset) if step)
-            leak = jnp.where(leads[axis], leak, 0)
+            leak = jnp.where(leads[axis], leak, 0) if axis in grid.state_axes else leak
         leaking = leaking + leak  # rates per unit time, (*grid): several small leaks add up
     # relative to all rates of the node, since terms of the drift may cancel up to their rounding
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()

@@ -151,11 +151,12 @@ def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
     """The minimum and maximum of ρ = max(min(r/β, ψ − V), g − V)."""
     layout, value, policy, obstacles = iterate.layout, iterate.value, iterate.policy, iterate.obstacles
-    if obstacles.upper is None and obstacles.lower is None:  # reductions first, without an array r/β
+    ceiling = obstacles.ceiling(value)
+    if ceiling is None and obstacles.lower is None:  # reductions first, without an array r/β
         return layout.least(policy.defect) / discount, layout.largest(policy.defect) / discount
     shift = policy.defect / discount
-    if obstacles.upper is not None:
-        shift = jnp.minimum(shift, obstacles.upper - value)
+    if ceiling is not None:
+        shift = jnp.minimum(shift, ceiling - value)
     if obstacles.lower is not None:
         shift = jnp.maximum(shift, obstacles.lower - value)
     # at fixed nodes V is exact; r is zero there, but ψ − V and g − V may differ from zero
@@ -172,8 +173,9 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     # then anyway
     rate = jnp.where(costs, policy.defect / jnp.where(costs, least_cost, 1), jnp.sign(policy.defect) * jnp.inf)
     relative = jnp.where(free, rate, 0)
-    # where V = ψ only ψ, which is imposed, bounds V_h from above
-    rising = relative if obstacles.upper is None else jnp.where(value < obstacles.upper, relative, 0)
+    # where V = ψ only ψ, which is imposed, bounds V_h from above, and likewise where the mode is changed
+    ceiling = obstacles.ceiling(value)
+    rising = relative if ceiling is None else jnp.where(value < ceiling, relative, 0)
     rho, eta = jnp.maximum(layout.largest(rising), 0), jnp.maximum(layout.largest(-relative), 0)
     # as numbers: for booleans XLA would make two passes
     priced = layout.largest(jnp.asarray(free & ~costs, value.dtype)) == 0

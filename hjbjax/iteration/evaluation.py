@@ -307,7 +307,7 @@ def relaxed(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     """
     equation = _walled(equation, grid)
     # a diagonal jump may stay on its hyperplane i₀ + i₁ + … = const, whose nodes are updated simultaneously
-    if any(sum(map(abs, offset)) > 1 for offset in equation.weights.offsets):
+    if any(sum(abs(offset[axis]) for axis in grid.state_axes) > 1 for offset in equation.weights.offsets):
         return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)  # four for each relaxation of a round
     return gauss_seidel.sweep(equation, grid, rounds)
 

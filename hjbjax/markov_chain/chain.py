@@ -13,7 +13,7 @@ import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges, stencil
 from hjbjax.discretisation.discretisation import Chain, Discretisation
-from hjbjax.discretisation.posing import without_horizon
+from hjbjax.discretisation.posing import with_mode_axis, without_horizon
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import decision_process, stationary_law
@@ -26,6 +26,7 @@ from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
 
+@with_mode_axis()
 @with_settled_functions
 def generator(
     problem: Problem,
@@ -60,6 +61,7 @@ def generator(
     return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
 
 
+@with_mode_axis()
 @with_settled_functions
 def matrix(
     problem: Problem,
@@ -90,6 +92,7 @@ def matrix(
     return stencil.sparse(steps.offsets, steps.values, np.maximum(1 - steps.total(), 0), grid)
 
 
+@with_mode_axis()
 @with_settled_functions
 def stationary_density(
     problem: Problem,

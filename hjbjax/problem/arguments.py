@@ -42,6 +42,7 @@ def with_calls_by_name(
     Arguments that do not fit go to ``function``, which raises Python's TypeError.
     """
     signature = inspect.signature(function)
+    rest = [each.name for each in signature.parameters.values() if each.kind is each.VAR_KEYWORD]
 
     @functools.wraps(function)
     def called(*arguments: P.args, **options: P.kwargs) -> Any:
@@ -49,6 +50,8 @@ def with_calls_by_name(
             given = dict(signature.bind(*arguments, **options).arguments)
         except TypeError:
             return function(*arguments, **options)
+        for name in rest:  # ``**options``
+            given |= given.pop(name, {})
         return call(function, given)
 
     return called

@@ -27,7 +27,7 @@ CONTINUED = ("open", "linear", "robin")  # kinds of ends beyond which V is exten
 TABLED = 2**24  # points of an axis with a stored table, 128 MiB; a larger grid must not allocate before it is refused
 
 
-@pytree_dataclass(static=("shape", "periodic", "names", "edges", "units"))
+@pytree_dataclass(static=("shape", "periodic", "names", "edges", "units", "modes"))
 class Grid:
     """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
 
@@ -66,6 +66,7 @@ class Grid:
     stretch: tuple[Stretching | None, ...] = ()
     edges: Any = "projected"
     units: tuple[str, ...] = ()
+    modes: tuple[str, ...] = dataclasses.field(init=False, repr=False, default=())  # see ``mode_axis``
     _coordinates: tuple[Any, ...] = dataclasses.field(init=False, repr=False)
     _spacings: tuple[Any, ...] | None = dataclasses.field(init=False, repr=False, default=None)  # see ``tabulated``
     _layout: Layout | None = dataclasses.field(init=False, repr=False, default=None)  # None: all nodes on one device
@@ -130,6 +131,11 @@ class Grid:
     def ndim(self) -> int:
         """The number of states n."""
         return len(self.shape)
+
+    @property
+    def state_axes(self) -> tuple[int, ...]:
+        """The axes along which the state moves: all, except a first axis of modes, along which it only jumps."""
+        return tuple(range(1 if self.modes else 0, self.ndim))
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from hjbjax.problem import labels as labelling
 from hjbjax.problem.labels import COST, REWARD, Labels
+from hjbjax.problem.modes import Modes
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, AnyControl, Ball, Box, Finite
 from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
@@ -37,7 +38,7 @@ class Problem:
     Functions act on one state. ``drift``, ``cost``, ``reward`` and a callable ``noise`` take ``(x, u)``; they take
     ``(x, u, d)`` if ``disturbances`` is given. ``target``, ``running_max`` and the payments ``exit_cost``,
     ``terminal_cost`` and ``stopping_cost``, or the rewards of the same names, take ``(x)``. With
-    ``time_dependent=True`` the time comes first in all.
+    ``time_dependent=True`` the time comes first in all, and with ``modes`` the number of the mode comes last in all.
 
     The control minimises costs. Give ``reward`` and the other rewards instead to maximise: the value is then the
     largest reward, and the disturbance minimises it. Value, bounds, derivatives and pictures have the sign of the
@@ -65,6 +66,8 @@ class Problem:
       exit_reward: the reward received on the target; a number or a function. Default: zero.
       terminal_reward: V at the horizon, for ``march``: scrap value, bequest or payoff.
       stopping_reward: the reward for stopping, at any time: V ≥ the reward, as for an American option.
+      modes: the regimes between which the system changes at random or by choice, see ``Modes``. Values then have the
+        shape (k, *grid).
       isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min. With rewards
         the disturbance also sees u if ``"upper"``: max over u of min over d.
       time_dependent: True if the functions take the time as their first argument.
@@ -97,6 +100,7 @@ class Problem:
     terminal_cost: Any = None
     stopping_cost: Any = None
     running_max: Any = None
+    modes: Modes | None = None
     isaacs: str = "upper"
     time_dependent: bool = False
     control_names: tuple[str, ...] = ()
@@ -110,6 +114,9 @@ class Problem:
     payoff: str = dataclasses.field(init=False, default=COST, repr=False)
     # the part of the discount that is a function of the state, in the problem of a march; the other part is constant
     killing: Any = dataclasses.field(init=False, default=None, repr=False)
+    # the changes of the mode if the state begins with it, see ``mode_axis``: rates, and costs for the controller
+    mode_rates: Any = dataclasses.field(init=False, default=None, repr=False)
+    switching_costs: Any = dataclasses.field(init=False, default=None, repr=False)
 
     def __init__(
         self,
@@ -125,6 +132,7 @@ class Problem:
         terminal_cost: Callable | Number | None = None,
         stopping_cost: Callable | Number | None = None,
         running_max: Callable | None = None,
+        modes: Modes | None = None,
         isaacs: str = "upper",
         time_dependent: bool = False,
         control_names: Sequence[str] = (),
@@ -146,6 +154,8 @@ class Problem:
         discount = _rate(discount)
         if not isinstance(time_dependent, (bool, np.bool_)):
             raise TypeError(f"Problem.time_dependent: got {time_dependent!r}, wanted True or False")
+        if modes is not None and not isinstance(modes, Modes):
+            raise TypeError(f"Problem.modes: got {modes!r}, wanted hjb.Modes(('low', 'high'), rates=...)")
         # with a running maximum, V ≥ g, there is no integral to discount, so β V − L has no meaning
         if running_max is not None and (cost is not None or _is_nonzero(discount)):
             raise ValueError(
@@ -173,6 +183,7 @@ class Problem:
             "discount": discount,
             "target": as_partial(target, "Problem.target"),
             "running_max": as_partial(running_max, "Problem.running_max"),
+            "modes": modes,
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
             "control_names": words.controls,
@@ -182,6 +193,8 @@ class Problem:
             "discounted": callable(discount) or (None if is_traced(discount) else bool(discount > 0)),
             "payoff": payoff,
             "killing": None,
+            "mode_rates": None,
+            "switching_costs": None,
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -225,6 +238,12 @@ def is_discounted(problem: Problem) -> bool | None:
     if is_traced(problem.discount):
         return problem.discounted
     return bool(np.all(np.asarray(problem.discount) > 0))  # a batch has one discount per problem: all must be positive
+
+
+def is_random(problem: Problem) -> bool:
+    """True if paths of the problem are random: noise, or random changes of the mode."""
+    changes = problem.mode_rates is not None or (problem.modes is not None and problem.modes.rates is not None)
+    return problem.noise is not None or changes
 
 
 def is_constrained(problem: Problem) -> bool:

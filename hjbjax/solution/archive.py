@@ -7,6 +7,7 @@ import numpy as np
 from hjbjax.problem import labels as labelling
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
+from hjbjax.problem.mode_axis import with_modes
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.files import Expected, FileError
 from hjbjax.solution.status import Status
@@ -43,6 +44,7 @@ def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             "edges": grid.edges,
             "names": grid.names,
             "units": grid.units,
+            "modes": grid.modes,
             "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch],
         },
         "labels": solution.labels,
@@ -92,11 +94,16 @@ def fields(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """The arguments of ``Solution`` from the header and the arrays of a file; ``Grid`` checks its own arguments."""
     about = header["grid"]
     stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
-    grid = Grid(
-        arrays.pop("lo"), arrays.pop("hi"), tuple(about["shape"]), about["periodic"], tuple(about["names"]), stretch,
-        about.get("edges", "projected"),  # missing in older files, in which all ends are projected
-        tuple(about.get("units", ())),  # missing in older files, like the labels
-    )  # fmt: skip
+    modes, edges = (
+        tuple(about.get("modes", ())),
+        about.get("edges", "projected"),
+    )  # in older files all ends are projected
+    rest = slice(1 if modes else 0, None)  # without the axis of modes
+    grid = with_modes(Grid(
+        arrays.pop("lo")[rest], arrays.pop("hi")[rest], tuple(about["shape"])[rest], about["periodic"][rest],
+        tuple(about["names"])[rest], stretch[rest], edges if isinstance(edges, str) else edges[rest],
+        tuple(about.get("units", ()))[rest],  # missing in older files, like the labels
+    ), modes)  # fmt: skip
     labels = labelling.of_file(header.get("labels", Labels()))
     header = {"monotone_error": None, **header}  # missing in older files
     for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``, because True is not a number of steps

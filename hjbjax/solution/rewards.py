@@ -15,6 +15,7 @@ import numpy as np
 from hjbjax.problem.arguments import with_calls_by_name
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST, REWARD
+from hjbjax.problem.mode_axis import with_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, is_traced
 from hjbjax.problem.rewards import costs_of, negative, negative_ends
@@ -43,7 +44,8 @@ def in_rewards(solution: Solution, grid: Grid, problem: Problem | None = None) -
     if solution.labels.payoff == REWARD:
         return solution
     known = None if is_traced(problem) else problem
-    found = _negative(solution, REWARD, negative_ends(solution.grid) if grid is None else grid, known)
+    own = negative_ends(solution.grid) if grid is None else with_modes(grid, solution.grid.modes)
+    found = _negative(solution, REWARD, own, known)
     if isinstance(sentence := found.stats.get("certificate"), str):
         words = next(((old, new) for old, new in WORDS.items() if old in sentence), ("", ""))
         found.stats["certificate"] = sentence.replace(*words)

@@ -5,6 +5,7 @@ in Python, and a statistic of an unexpected type is replaced by the name of its 
 """
 
 import base64
+import functools
 import html
 import io
 import math
@@ -62,7 +63,7 @@ class _Answer(Protocol):
 def show(solution: _Answer) -> str:
     """The printed summary of a solution: at most 15 lines; unknown entries are left out."""
     stats, grid = solution.stats, solution.grid
-    axes = " x ".join(name + " (periodic)" * flag for name, flag in zip(grid.labels, grid.periodic, strict=True))
+    axes = " x ".join(map(functools.partial(_axis_text, grid), range(grid.ndim)))
     last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
     reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
     compiling = f", and {number(stats['compile_seconds'])} to check and compile" if "compile_seconds" in stats else ""
@@ -93,6 +94,13 @@ def _devices(stats: dict[str, Any]) -> str:
     """The kind of device, with the shape of the mesh if the nodes are divided among several devices."""
     kind, mesh = number(stats["device"]), stats.get("mesh")
     return f"{' x '.join(map(number, mesh))} {kind}" if isinstance(mesh, (list, tuple)) else kind
+
+
+def _axis_text(grid: Grid, axis: int) -> str:
+    """The name of an axis, and whether it is periodic; of an axis of modes their names."""
+    if axis not in grid.state_axes:
+        return f"modes {', '.join(grid.modes)}"
+    return grid.labels[axis] + " (periodic)" * grid.periodic[axis]
 
 
 def thumbnail(solution: _Answer) -> str:

@@ -33,6 +33,7 @@ from hjbjax.solution.interpolation import (
     slopes_between,
     times_outside,
 )
+from hjbjax.solution.modes import of_one_mode, states_in_mode, switching_modes
 from hjbjax.solution.placement import Path
 from hjbjax.solution.status import Status, warn
 
@@ -184,7 +185,29 @@ class Solution:
         """The last residual; ``None`` if none was recorded."""
         return float(self.residuals[-1]) if len(self.residuals) else None
 
-    def value_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
+    def in_mode(self, mode: str | int) -> "Solution":
+        """The solution in one mode, on the grid of the states: for pictures and for everything that knows no modes.
+
+        Args:
+          mode: the name or the number of a mode.
+
+        Raises:
+          ValueError: there is no such mode.
+        """
+        return of_one_mode(self, mode)
+
+    @property
+    def switching(self) -> Any:
+        """The number of the mode to which the controller changes at once, at every node; the node's own elsewhere.
+
+        Integers of the shape of the value. ``None`` if the controller cannot change the mode.
+
+        Raises:
+          ValueError: the solution came from a file or from ``jit``, where the problem is not known.
+        """
+        return switching_modes(self)
+
+    def value_at(self, *where: Numbers | Sequence, mode: str | int | None = None, clamp: bool = False) -> Any:
         """V between the nodes: ``value_at(x)``, or ``value_at(t, x)`` for a marched solution; works under jit and vmap.
 
         Multilinear interpolation, second order, also in time. For concrete states and data the result is float64 NumPy,
@@ -192,6 +215,7 @@ class Solution:
 
         Args:
           where: states x, shape (n,) or (..., n); for a marched solution preceded by the time, a number or shape (...).
+          mode: the name or the number of the mode, if the problem has modes; otherwise the states begin with it.
           clamp: use the nearest point for states outside the grid and times outside the kept times; otherwise NaN.
 
         Returns:
@@ -201,18 +225,19 @@ class Solution:
           ValueError: a state of the wrong length, a missing or unneeded time, or a batch of solutions.
           TypeError: the states are not numbers.
         """
-        return self._query("value_at", between, self.value, 0, where, clamp)
+        return self._query("value_at", between, self.value, 0, where, clamp, mode)
 
-    def costate_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
+    def costate_at(self, *where: Numbers | Sequence, mode: str | int | None = None, clamp: bool = False) -> Any:
         """DV between the nodes, shape ``x.shape[:-1] + (n,)``; arguments and errors as for ``value_at``.
 
         This is the current-value costate of Pontryagin's principle. Central differences at the nodes (parabolas through
         three nodes next to an end) are interpolated: second order where V is smooth; a kink is smeared over two cells.
         Next to infinite values the differences are one-sided; the result is NaN where none exists.
         """
-        return self._query("costate_at", slopes_between, self.value, 0, where, clamp)
+        found = self._query("costate_at", slopes_between, self.value, 0, where, clamp, mode)
+        return found[..., 1:] if self.grid.modes else found  # V has no slope along the modes
 
-    def control_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
+    def control_at(self, *where: Numbers | Sequence, mode: str | int | None = None, clamp: bool = False) -> Any:
         """u between the nodes, shape ``x.shape[:-1] + (m,)``; arguments and errors as for ``value_at``.
 
         Only the nodes of the cell where a control is defined are used, with weights scaled to sum to one. The feedback
@@ -222,21 +247,24 @@ class Solution:
         """
         # the mean of two elements of a finite set is not in the set
         look = nearest if self.discrete else between_defined
-        return self._query("control_at", look, self.policy, 1, where, clamp)
+        return self._query("control_at", look, self.policy, 1, where, clamp, mode)
 
-    def disturbance_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
+    def disturbance_at(self, *where: Numbers | Sequence, mode: str | int | None = None, clamp: bool = False) -> Any:
         """The opponent's d between the nodes, shape ``x.shape[:-1] + (l,)``; see ``control_at``."""
         look = nearest if self.discrete_disturbance else between_defined
-        return self._query("disturbance_at", look, self.disturbance, 1, where, clamp)
+        return self._query("disturbance_at", look, self.disturbance, 1, where, clamp, mode)
 
     def _query(
-        self, name: str, look: Interpolation, values: Array | None, trailing: int, where: tuple, clamp: bool
-    ) -> Array:
+        self, name: str, look: Interpolation, values: Array | None, trailing: int, where: tuple, clamp: bool,
+        mode: str | int | None,
+    ) -> Array:  # fmt: skip
         """Values between the nodes by the rule ``look``; ``trailing`` is the number of axes per node."""
         if values is None:
             lacking = "policy" if name == "control_at" else "disturbance: the problem is not a game"
             raise ValueError(f"Solution.{name}: this solution has no {lacking}")
         t, x = check_query(self, name, values, trailing, where)
+        if mode is not None:
+            x = states_in_mode(self.grid, x, mode, f"Solution.{name}")
         samples = Samples(self.grid, values, self.times)
         found = query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
         known = not clamp and t is not None and not is_traced(found, t, self.times)

@@ -112,7 +112,7 @@ def _along_axes(value: np.ndarray, fine: Grid, coarse: Grid) -> _Differences:
     """Differences of values on the finer grid over ``REACH`` nodes along every axis; NaN values are skipped."""
     first = second = extent = np.zeros(coarse.shape)
     for axis, count in enumerate(fine.shape):
-        if count == 2:  # a chain of two states
+        if count == 2 or axis not in fine.state_axes:  # a chain of two states
             continue
         line = value
         for other in range(fine.ndim):
@@ -131,7 +131,7 @@ def _around(value: np.ndarray, grid: Grid) -> _Differences:
     """Differences of values on the coarser grid over every node and its neighbours; NaN values are skipped."""
     first = second = np.zeros(grid.shape)
     for axis, count in enumerate(grid.shape):
-        if count == 2:
+        if count == 2 or axis not in grid.state_axes:
             continue
         steps = np.diff(_padded(value, grid, axis, np.nan), axis=axis)
         below, above = (_part(steps, axis, k, count) for k in (0, 1))
@@ -177,9 +177,9 @@ def _padded(values: np.ndarray, grid: Grid, axis: int, beyond: float | None, rea
 
 def _combined(values: np.ndarray, grid: Grid, combine: Callable[[Any, Any], Any]) -> np.ndarray:
     """Combine the values of every node and its neighbours."""
-    for axis, count in enumerate(grid.shape):
+    for axis in grid.state_axes:
         wide = _padded(values, grid, axis, None)
-        below, here, above = (_part(wide, axis, k, count) for k in range(3))
+        below, here, above = (_part(wide, axis, k, grid.shape[axis]) for k in range(3))
         values = combine(combine(below, here), above)
     return values
 

@@ -2,11 +2,13 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from hjbjax.problem.grid import Grid, with_prescriptions_of
+from hjbjax.problem.mode_axis import with_modes, without_modes
 
 FEWEST = 12  # least number of intervals per axis of a coarser grid
 FEWEST_TELLING = 6  # least number of intervals on a coarser grid that estimates the error of the finer one
@@ -23,12 +25,12 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
     shape = []
     for axis, count in enumerate(grid.shape):
         intervals = grid.intervals(axis)
-        half = (intervals + 1) // 2
+        half = (intervals + 1) // 2 if axis in grid.state_axes else 0
         # count - intervals is 1, or 0 on a periodic axis, whose upper end is not a node
         shape.append(count - intervals + half if half >= fewest else count)
     if tuple(shape) == grid.shape:
         return None
-    return with_faces_of(grid, dataclasses.replace(grid, shape=tuple(shape)))
+    return with_faces_of(grid, resized(grid, shape))
 
 
 def comparison_grid(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
@@ -43,7 +45,7 @@ def comparison_grid(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Gr
       held: the fixed nodes, bool (*grid).
       nested: require that all coarse nodes are nodes of ``grid``.
     """
-    many = [axis for axis, count in enumerate(grid.shape) if count > 2 or grid.periodic[axis]]
+    many = [axis for axis in grid.state_axes if grid.shape[axis] > 2 or grid.periodic[axis]]
     choices = {axis: _fewer(grid.intervals(axis), nested) for axis in many}
     if not choices or not all(choices.values()):
         return None
@@ -79,7 +81,13 @@ def _resized(grid: Grid, intervals: dict[int, int]) -> Grid:
     shape = list(grid.shape)
     for axis, few in intervals.items():
         shape[axis] += few - grid.intervals(axis)
-    return dataclasses.replace(grid, shape=tuple(shape))
+    return resized(grid, shape)
+
+
+def resized(grid: Grid, shape: Sequence[int]) -> Grid:
+    """The grid with another number of nodes per axis of the state."""
+    bare = dataclasses.replace(without_modes(grid), shape=tuple(shape)[1 if grid.modes else 0 :])
+    return with_modes(bare, grid.modes) if grid.modes else bare
 
 
 def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
@@ -88,7 +96,7 @@ def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
         return True
     known = prolong(held.astype(float), fine, coarse) > 1 - ROUNDING
     kept = held & (prolong(known.astype(float), coarse, fine) > ROUNDING)
-    for axis in range(fine.ndim):  # a fixed node next to a kept one counts as kept, such as the tip of a disc
+    for axis in fine.state_axes:  # a fixed node next to a kept one counts as kept, such as the tip of a disc
         along = np.moveaxis(kept, axis, 0)
         wide = along.copy()
         wide[1:] |= along[:-1]

@@ -6,6 +6,7 @@ import math
 import numpy as np
 
 from hjbjax.discretisation.discretisation import Scheme
+from hjbjax.discretisation.posing import with_mode_axis
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.methods import Method, Nested
 from hjbjax.problem import arguments
@@ -22,6 +23,7 @@ from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import keeping_warnings
 from hjbjax.solvers import memory, semi_lagrangian
 from hjbjax.solvers.coarse_levels import below
+from hjbjax.solvers.nested_grids import resized
 from hjbjax.solvers.setup import check_on_one_state, choose
 from hjbjax.solvers.stationary import check_arguments, solve
 
@@ -85,6 +87,7 @@ class Estimate:
         )
 
 
+@with_mode_axis()
 @front_door
 def estimate(
     problem: Problem,
@@ -187,11 +190,14 @@ def _smaller(grid: Grid, nodes: float) -> Grid:
     """The grid with about this number of nodes; an axis with a node in its middle keeps it."""
     share, shape = (nodes / grid.size) ** (1 / grid.ndim), []
     for axis, count in enumerate(grid.shape):
+        if axis not in grid.state_axes:
+            shape.append(count)
+            continue
         intervals = grid.intervals(axis)
         fewer = max(round(share * intervals), FEWEST)
         fewer += (intervals - fewer) % 2
         shape.append(count - intervals + min(fewer, intervals))
-    return dataclasses.replace(grid, shape=tuple(shape))
+    return resized(grid, shape)
 
 
 def _alike(method: Method, small: Grid, grid: Grid) -> Method:

@@ -16,15 +16,17 @@ from hjbjax.problem import sets
 from hjbjax.problem.arguments import check_count, check_mesh
 from hjbjax.problem.ends import KINDS
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.mode_axis import refuse_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, remembered
 from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import indices, jaxprs
 from hjbjax.tracing.operations import Operations, operations
 
-OF_ACTION = ("drift", "cost", "noise")
+OF_ACTION = ("drift", "cost", "noise", "mode_rates")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
 RATES = ("discount", "killing")
+USERS_NAMES = {"killing": "discount", "mode_rates": "Modes.rates", "switching_costs": "Modes.switching_cost"}
 
 _ADVICE = (  # most specific first, since TracerBoolConversionError is a ConcretizationTypeError
     (
@@ -64,7 +66,8 @@ def shapes(problem: Problem, grid: Grid, scheme: Any) -> None:
       ValueError: a result of the wrong shape or kind, a wrong number of arguments, code that JAX cannot trace.
     """
     needed = scheme.points
-    for axis, count in enumerate(grid.shape):
+    for axis in grid.state_axes:
+        count = grid.shape[axis]
         if count < needed:
             raise ValueError(f"axis {axis} has {count} points; {type(scheme).__name__} needs at least {needed}")
     n = grid.ndim
@@ -126,6 +129,8 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
       ValueError: as for ``shapes``.
     """
 
+    refuse_modes(problem)
+
     def expect(name: str, wanted: str, fits: Callable[[tuple], bool]) -> None:
         _expect(problem, name, n, wanted, fits, "a scalar" if wanted == "()" else f"n = {n} is {meaning}")
 
@@ -142,7 +147,7 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
 
 def call(problem: Problem, name: str) -> str:
     """A function with the arguments that the problem passes, as in ``drift(x, u)``."""
-    said = "discount" if name == "killing" else problem.labels.word(name)
+    said = USERS_NAMES.get(name) or problem.labels.word(name)
     if not callable(getattr(problem, name)):
         return said
     return f"{said}({', '.join(_names(problem, name))})"

@@ -25,6 +25,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.mode_axis import refuse_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced
 from hjbjax.problem.rewards import costs_of
@@ -49,8 +50,8 @@ from hjbjax.tracing.outside import (
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-OF_ACTION = ("drift", "cost", "noise")
-OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max")
+OF_ACTION = ("drift", "cost", "noise", "mode_rates")
+OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max", "switching_costs")
 RATES = ("discount", "killing")  # numbers, or functions of the state
 
 
@@ -62,6 +63,7 @@ def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
       n: the number of states.
       dtype: the floating-point type inside a JAX transformation. Default: JAX's default float there.
     """
+    refuse_modes(problem)
     functions = {
         name: getattr(problem, name) for name in (*OF_ACTION, *OF_STATE, *RATES) if callable(getattr(problem, name))
     }

@@ -136,26 +136,28 @@ class Influence:
     """Dependence of drift, cost and noise on both players' inputs, the control's first, then the disturbance's.
 
     Attributes:
-      drift, cost, noise: the dependences.
+      drift, cost, noise, switching: the dependences; the last one of the rates of changes of the mode.
       control, disturbance: the inputs of each player.
     """
 
     drift: Dependence
     cost: Dependence
     noise: Dependence
+    switching: Dependence
     control: range
     disturbance: range
 
     @property
     def separable(self) -> bool:
-        """True if drift and cost are sums of one part per player, and the noise depends on neither."""
-        crossed = any(function.crosses(self.control, self.disturbance) for function in (self.drift, self.cost))
+        """True if drift, cost and rates are sums of one part per player, and the noise depends on neither."""
+        functions = (self.drift, self.cost, self.switching)
+        crossed = any(function.crosses(self.control, self.disturbance) for function in functions)
         return not crossed and self.noise.is_constant
 
     @property
     def operations(self) -> Operations:
-        """The operations of one evaluation of drift, cost and noise."""
-        return self.drift.operations + self.cost.operations + self.noise.operations
+        """The operations of one evaluation of drift, cost, noise and rates."""
+        return self.drift.operations + self.cost.operations + self.noise.operations + self.switching.operations
 
     @property
     def meet(self) -> bool:
@@ -172,7 +174,9 @@ def influence(problem: Problem, n: int, dtype: DType) -> Influence:
     def of(function: object) -> Dependence:
         return dependence(function, *arguments, dtype=dtype) if callable(function) else Dependence((CONSTANT,))
 
-    return Influence(of(problem.drift), of(problem.cost), of(problem.noise), range(m), range(m, m + k))
+    return Influence(
+        of(problem.drift), of(problem.cost), of(problem.noise), of(problem.mode_rates), range(m), range(m, m + k)
+    )
 
 
 def _some_function(operands: Iterable[Terms]) -> Terms:

@@ -140,18 +140,42 @@ def reached(
     # exactly to a path. Every pass uses admissible actions only, so the union of the passes is also reachable.
     for count, kinks in dict.fromkeys([(few, False), (len(points), False), (len(points), True)]):
         jumps = functools.partial(_open_jumps, on, points=points, count=count, clock=clock, least=least, kinks=kinks)
-        more = _reached_by(jumps, held, surely, on.grid, clock)
+        more = _reached_by(jumps, _changes(on), held, surely, on.grid, clock)
         found, maybe = found | more.surely, maybe | more.maybe
         if found.all():
             break
     return Reach(found, maybe)
 
 
-def _reached_by(open_jumps: Callable[..., Rates], held: np.ndarray, surely: bool, grid: Grid, clock: Clock) -> Reach:
-    """The nodes from which the fixed nodes are reached by ``open_jumps(inside=...)``."""
+def _changes(on: Discretisation) -> Rates:
+    """The changes of the mode that the controller may make, as jumps, bool (*grid) each."""
+    costs = _switching_costs(on) if on.problem.switching_costs is not None else []
+    offsets = (stencil.unit(on.grid, 0, k) for k in range(1, len(costs) + 1))
+    return Rates(tuple(offsets), tuple(np.isfinite(np.asarray(cost)) for cost in costs))
+
+
+_switching_costs = jax.jit(Discretisation.switching_costs)
+
+
+def _led_inside(changes: Rates, inside: jax.Array | None, grid: Grid) -> list[np.ndarray]:
+    """The changes of the mode that lead ``inside``, bool (*grid) each."""
+    if inside is None:
+        return list(changes.values)
+    return [
+        each & np.asarray(stencil.neighbour(inside, grid, offset))
+        for offset, each in zip(changes.offsets, changes.values, strict=True)
+    ]
+
+
+def _reached_by(
+    open_jumps: Callable[..., Rates], changes: Rates, held: np.ndarray, surely: bool, grid: Grid, clock: Clock
+) -> Reach:
+    """The nodes from which the fixed nodes are reached by ``open_jumps(inside=...)`` and by changes of the mode."""
 
     def staying(inside: jax.Array | None) -> np.ndarray:
-        return _backward_reach(held, open_jumps(inside=inside), grid, clock)
+        jumps = open_jumps(inside=inside)
+        jumps = Rates((*jumps.offsets, *changes.offsets), (*jumps.values, *_led_inside(changes, inside, grid)))
+        return _backward_reach(held, jumps, grid, clock)
 
     maybe = found = staying(None)
     inside = np.ones(held.shape, bool)

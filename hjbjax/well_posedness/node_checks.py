@@ -48,6 +48,8 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
     # x64 for 64-bit counts; the functions are still evaluated in ``dtype``
     with own_settings(x64=True):
         # nearly every problem passes and skips the counts and first nodes, which are slow on a CPU
+        if problem.switching_costs is not None:
+            _check_round_trips(np.asarray(_switching_costs(on)), grid)
         if _all_pass(on, actions, clock):
             return
         clock.look()
@@ -62,6 +64,9 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
             f"{call(problem, 'noise')} is negative at {where}.\nWanted numbers ≥ 0: it is σ in dx = f dt + σ dw; "
             "only an (n, k) matrix may hold negative entries"
         )
+    if "negative rate" in found and found["negative rate"].nodes:
+        where = _where(problem, grid, found["negative rate"], actions)
+        raise ValueError(f"{call(problem, 'mode_rates')} is negative at {where}.\nWanted rates ≥ 0, per unit time")
     if "correlation" in found and found["correlation"].nodes:
         _refuse_noise(on, found["correlation"], actions)
     if "diffusion" in found and found["diffusion"].nodes:
@@ -72,6 +77,33 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
         )
     if problem.target is not None:
         _check_target(problem, grid, int(found["inside"]), found["nearest"])
+
+
+def _check_round_trips(costs: np.ndarray, grid: Grid) -> None:
+    """Refuse costs of changing the mode, (k − 1, *grid), that are not numbers ≥ 0, and round trips that cost nothing.
+
+    At no cost the controller could change the mode for ever.
+    """
+    count = len(costs) + 1
+    # least[d] is the cheapest way from mode i to mode i + d by the changes so far; d = 0 is a round trip
+    least = np.concatenate([np.full((1, *costs.shape[1:]), np.inf), costs])
+    for _ in range(count):
+        through = [least[d] + np.roll(costs[e - 1], -d, axis=0) for d in range(count) for e in range(1, count)]
+        ends = [(d + e) % count for d in range(count) for e in range(1, count)]
+        for d, cost in zip(ends, through, strict=True):
+            least[d] = np.minimum(least[d], cost)
+    bad = np.isnan(costs).any(axis=0) | (costs < 0).any(axis=0) | ~(least[0] > 0)
+    if bad.any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        where = f"in mode {grid.modes[index[0]]!r} at x = {_numbers(grid.state(index)[1:])}"
+        raise ValueError(
+            f"Modes.switching_cost: a cost is negative or NaN, or a round trip of changes costs nothing, {where}.\n"
+            "Wanted costs ≥ 0, infinity to forbid a change, and more than zero for every round trip: otherwise the "
+            "controller would change the mode for ever"
+        )
+
+
+_switching_costs = jax.jit(lambda on: jnp.stack(on.switching_costs()))
 
 
 class _Finding(NamedTuple):
@@ -202,6 +234,9 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, j
         # entries of a matrix may be negative, like correlations; a number or a diagonal is a size
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
+    if rates := on.mode_rates(u, d, x):
+        bad["mode_rates"] = faulty(rates)
+        bad["negative rate"] = functools.reduce(jnp.logical_or, (rate < 0 for rate in rates))
     # diagonal jumps take their rates from the jumps along the axes, which must not become negative
     lacking = correlated_noise.lacking(on, a)
     if lacking is not None:
@@ -246,7 +281,9 @@ def _place(grid: Grid, flat: Array) -> tuple[tuple[int, ...], np.ndarray]:
 def _where(problem: Problem, grid: Grid, finding: _Finding, actions: tuple[np.ndarray, np.ndarray] | None) -> str:
     """ "3 of 100 nodes, first at node (0, 1), x = [...], with u = [...]"."""
     index, x = _place(grid, finding.first)
-    text = f"{int(finding.nodes)} of {grid.size} nodes, first at node {index}, x = {_numbers(x)}"
+    x = x[1:] if grid.modes else x
+    mode = f" in mode {grid.modes[index[0]]!r}" if grid.modes else ""
+    text = f"{int(finding.nodes)} of {grid.size} nodes, first{mode} at node {index}, x = {_numbers(x)}"
     if actions is not None:
         given = zip("ud", actions, strict=True)
         played = [f"{letter} = {_numbers(rows[finding.action])}" for letter, rows in given if rows.shape[1]]

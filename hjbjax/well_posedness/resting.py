@@ -60,8 +60,11 @@ def standstill(on: Discretisation) -> Standstill:
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
     for axis, speed in enumerate(_noise_speeds(on, u, d)):
         rests &= speed <= small * speeds[axis]
+    for rate in on.mode_rates(u, d):  # in another mode it may move
+        rests &= rate == 0
     # axes one after another: an upper bound for any direction of motion
-    extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in range(grid.ndim)])
+    extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in grid.state_axes])
+    speeds = speeds[1:] if grid.modes else speeds
     return Standstill(rests, least, jnp.sum(extents / speeds))
 
 

@@ -107,12 +107,15 @@ def test_one_signed_weight_does_for_two_of_which_one_is_zero(cache, monkeypatch)
 @pytest.mark.parametrize(("n", "flags"), LAYOUTS, ids=ids)
 def test_a_shear_puts_hyperplanes_into_slices_and_can_be_undone(n, flags):
     values = np.random.default_rng(0).normal(size=SHAPES[n])
-    shear, undo = jax.jit(gauss_seidel._sheared), jax.jit(gauss_seidel._from_planes)
+    arrays = gauss_seidel._arrays_of(make_grid(n, flags))
+    shear, undo = (
+        jax.jit(lambda values, flips, function=function: function(values, flips, arrays))
+        for function in (gauss_seidel._sheared, gauss_seidel._from_planes)
+    )
     for flips in itertools.product((0, 1), repeat=n - 1):
         sheared = np.asarray(shear(values, list(flips)))
         flipped = np.flip(values, [axis + 1 for axis, flip in enumerate(flips) if flip])
         for index in np.ndindex(*values.shape):
             assert sheared[(sum(index) % values.shape[0], *index[1:])] == flipped[index]
-        assert np.array_equal(
-            undo(np.pad(sheared, gauss_seidel._margins(n), constant_values=np.nan), list(flips)), values
-        )
+        padded = np.pad(sheared, arrays.margins, constant_values=np.nan)
+        assert np.array_equal(undo(padded, list(flips)), values)

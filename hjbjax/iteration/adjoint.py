@@ -265,10 +265,19 @@ def _tied_to_constraints(equation: PolicyEquation, obstacles: Obstacles, value: 
         free &= ~_is_constraint(value, constraint)
     # a row without weights reads δ = s, the derivative of the constraint
     weights = equation.weights.scaled(jnp.where(free, 1, 0))
-    stops = ~free & ~obstacles.fixed
-    if obstacles.lower is not None:
-        stops &= ~_is_constraint(value, obstacles.lower)
-    return PolicyEquation(equation.source, with_changes(weights, obstacles, value, stops), equation.fastest)
+    return PolicyEquation(equation.source, with_changes(weights, _changes(obstacles, value)), equation.fastest)
+
+
+def _changes(obstacles: Obstacles, value: Field) -> list[jax.Array]:
+    """The nodes at which the mode changes by 1, ..., k − 1: V is the value after this change, and no other bound."""
+    left, found = ~obstacles.fixed, []
+    for constraint in (obstacles.upper, obstacles.lower):
+        if constraint is not None:
+            left &= ~_is_constraint(value, constraint)
+    for after in obstacles.after_change(value):
+        found.append(left & _is_constraint(value, after))
+        left = left & ~found[-1]
+    return found
 
 
 def _constraints(obstacles: Obstacles, value: Field) -> list[Field]:

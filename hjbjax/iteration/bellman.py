@@ -13,7 +13,7 @@ w = 0 (or s = g − V). Every method solves this equation for the correction δ,
 
 import dataclasses
 import functools
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from hjbjax.discretisation.rates import Rates, fastest_rate, jump_rates
 from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import Field, Mask, Nodes, Number, Scalar
+from hjbjax.problem.types import Field, Nodes, Number, Scalar
 
 LEAK = 64  # units of eps of Q: a smaller rate towards an unreachable node is rounding
 ROUNDING = 8  # units of eps in (Q + β)|V|: a smaller gain of one action over another is rounding
@@ -67,12 +67,30 @@ class Obstacles:
         if self.upper is not None:
             value = jnp.minimum(value, self.upper)
         if self.switching:
-            value = jnp.where(self.fixed, self.fixed_value, value)
-            for _ in self.switching:  # a shortest path of changes has at most k − 1 of them
-                value = functools.reduce(jnp.minimum, self.after_change(value), value)
+            value = self.after_changes(jnp.where(self.fixed, self.fixed_value, value))
         if self.lower is not None:
             value = jnp.maximum(value, self.lower)
         return jnp.where(self.fixed, self.fixed_value, value)
+
+    def after_changes(self, value: Field) -> Field:
+        """The least of ``value`` and of its values in other modes plus the costs of changing to them, (*grid)."""
+        for _ in self.switching:  # a cheapest path of changes has at most k − 1 of them
+            value = functools.reduce(jnp.minimum, self.after_change(value), value)
+        return value
+
+    def changes(self, value: Field) -> list[jax.Array]:
+        """The nodes at which the mode changes by 1, ..., k − 1, if not changing it is worth ``value``; bool (*grid).
+
+        Following the changes of a node leads to a mode that is not changed, since no round trip is free.
+        """
+        bounds = self.after_change(self.after_changes(value))
+        left = functools.reduce(jnp.minimum, bounds, value) < value
+        found = []
+        for k, bound in enumerate(bounds):
+            goes = left & functools.reduce(jnp.logical_and, (bound <= other for other in bounds[k + 1 :]), left)
+            found.append(goes)
+            left = left & ~goes
+        return found
 
     def clipped(self, step: Field, value: Field) -> Field:
         """max(min(s, ψ − V), g − V) for a step s, and zero where V is fixed."""
@@ -249,39 +267,42 @@ def policy_equation(
         outflow = jnp.where(moves, leaving, jnp.where(fastest > 0, fastest, 1))
     # s, then min(s, ψ − V), then max(·, g − V); a row whose branch is a constraint reads δ = source
     source, free = policy.defect / outflow, ~obstacles.fixed
-    stops: Any = False
-    if (ceiling := obstacles.ceiling(value)) is not None:
-        stops = free & (ceiling - value < source)
-        source, free = jnp.where(stops, ceiling - value, source), free & ~stops
+    goes: list[jax.Array] = []
+    if obstacles.switching:
+        # compare with one step in the other mode, not with its value: otherwise two modes may change to each other
+        worth = jnp.where(free, value + source, value)
+        worth = worth if obstacles.upper is None else jnp.minimum(worth, obstacles.upper)
+        goes = [free & each for each in obstacles.changes(worth)]
+        for each, after in zip(goes, obstacles.after_change(value), strict=True):
+            source, free = jnp.where(each, after - value, source), free & ~each
+    if obstacles.upper is not None:
+        stops = free & (obstacles.upper - value < source)
+        source, free = jnp.where(stops, obstacles.upper - value, source), free & ~stops
     if obstacles.lower is not None:
         floored = ~obstacles.fixed & (obstacles.lower - value > source)
         source, free = jnp.where(floored, obstacles.lower - value, source), free & ~floored
-        stops = stops & ~floored if obstacles.switching else stops
+        goes = [each & ~floored for each in goes]
     weights = rates.scaled(jnp.where(free, 1 / outflow, 0))
     if on.cuts_links:  # links to fixed nodes end on the boundary of the target, where the correction is zero
         loose = ~obstacles.fixed
         jumps = zip(weights.offsets, weights.values, strict=True)
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
         weights = dataclasses.replace(weights, values=cut)
-    weights = with_changes(weights, obstacles, value, stops)
+    weights = with_changes(weights, goes)
     return PolicyEquation(source, weights, None if every_rate else fastest)
 
 
-def with_changes(weights: Rates, obstacles: Obstacles, value: Field, stops: Mask) -> Rates:
-    """The weights with a weight of one, to the best other mode, in the rows ``stops`` in which the mode is changed.
+def with_changes(weights: Rates, goes: Sequence[jax.Array]) -> Rates:
+    """The weights with a weight of one to another mode where the mode changes by 1, ..., k − 1.
 
     A change of the mode is a jump at no time: V_i = c_ij + V_j, so the row reads δ_i = s + δ_j.
     """
-    if not obstacles.switching:
+    if not goes:
         return weights
-    table, bounds = dict(zip(weights.offsets, weights.values, strict=True)), obstacles.after_change(value)
-    ceiling: Any = functools.reduce(jnp.minimum, bounds)
-    left = stops if obstacles.upper is None else stops & (ceiling < obstacles.upper)
-    for k, bound in enumerate(bounds, start=1):
-        offset = (k, *(0 for _ in value.shape[1:]))
-        goes = left & (bound <= ceiling)
-        table[offset] = table.get(offset, 0) + jnp.asarray(goes, value.dtype)
-        left = left & ~goes
+    table = dict(zip(weights.offsets, weights.values, strict=True))
+    for k, each in enumerate(goes, start=1):
+        offset = (k, *(0 for _ in each.shape[1:]))
+        table[offset] = table.get(offset, 0) + jnp.asarray(each, weights.values[0].dtype)
     return dataclasses.replace(weights, offsets=tuple(table), values=tuple(table.values()))
 
 

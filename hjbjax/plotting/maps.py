@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hjbjax.plotting.histories import controls
+from hjbjax.plotting.modes import by_mode
 from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks
 from hjbjax.plotting.shading import Look, draw, fill_missing, frame, is_level, jumps
 from hjbjax.plotting.slices import (
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
 
 @drawing
+@by_mode
 def value(
     solution: Solution,
     *,
@@ -58,7 +60,8 @@ def value(
 
     Keyword Args:
       ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
-      fixed: coordinates at which axes are cut, by number or name; at most two axes may remain free.
+      fixed: coordinates at which axes are cut, by number or name; at most two axes may remain free. For a problem with
+        modes also ``"mode"``; over one state all modes are drawn if it is not given.
       time: for a solution of ``march``, the time to draw. The nearest stored time is used; ``None`` is the earliest.
       levels: the number of contour lines, or their values; 0 for none.
       colorbar: draw a colour bar next to a two-dimensional plot.
@@ -107,6 +110,7 @@ def _without(section: Section, target: Callable[[State], Number] | None) -> tupl
 
 
 @drawing
+@by_mode
 def policy(
     solution: Solution,
     *,
@@ -273,7 +277,7 @@ def closed_loop(
     """Plot the path on the value function, and its states and inputs over time, in one figure.
 
     Args:
-      solution: the solution of ``solve``.
+      solution: the solution of ``solve``; of several modes the first of the path is drawn.
       path: the path of ``simulate`` for this solution.
 
     Keyword Args:
@@ -285,6 +289,8 @@ def closed_loop(
     Returns:
       The picture: the artists of the value first.
     """
+    if solution.grid.modes:
+        solution = solution.in_mode(int(np.asarray(path.modes)[0]))
     grid = solution.grid
     artists: list[Artist] = []
     plane, driven = grid.ndim > 1, np.shape(path.controls)[1] > 0

@@ -95,6 +95,7 @@ class SemiLagrangian(Scheme, Paths):
           ValueError: not supported; the message names an alternative.
         """
         for present, what in (
+            (bool(grid.modes), "a problem with modes"),
             (problem.noise is not None, "a problem with noise: its paths spread"),
             (problem.is_game, "a game: the disturbance would have to answer in the middle of an arc"),
             (problem.running_max is not None, "a running_max: the maximum is evaluated at nodes only"),

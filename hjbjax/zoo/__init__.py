@@ -54,6 +54,7 @@ from hjbjax.zoo.stochastic import (
     brownian_exit,
     brownian_exit_exact,
 )
+from hjbjax.zoo.switching import Saving, Thermostat, saving, thermostat
 
 _ENTRIES = (
     # slightly off the hanging position θ = π, where swinging up to the left and to the right cost the same
@@ -161,8 +162,10 @@ __all__ = [
     "Pendulum",
     "PlanarQuadrotor",
     "Pomet",
+    "Saving",
     "SingleIntegrator",
     "Smooth",
+    "Thermostat",
     "Unicycle",
     "VanDerPol",
     "bang_bang",
@@ -189,10 +192,12 @@ __all__ = [
     "moon_landing_exact",
     "pendulum",
     "pendulum_near_upright",
+    "saving",
     "smooth",
     "smooth_exact",
     "stochastic_lq",
     "stochastic_lq_exact",
+    "thermostat",
     "van_der_pol",
     "zermelo",
     "zermelo_exact",

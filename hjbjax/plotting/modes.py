@@ -1,0 +1,61 @@
+"""Pictures of solutions with modes: one mode, or over one state all modes in one picture."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ParamSpec
+
+from hjbjax.plotting.slices import Cuts
+from hjbjax.plotting.style import COLOURS, Picture, axes_of, legend
+
+if TYPE_CHECKING:
+    from hjbjax.solution.solution import Solution
+
+P = ParamSpec("P")
+MODE = "mode"  # the name of the axis of modes
+
+
+def of_one_mode(solution: Solution, fixed: Cuts | None) -> tuple[Solution, Cuts | None]:
+    """The solution in the mode that ``fixed`` gives by name or number, and the other cuts.
+
+    Raises:
+      ValueError: ``fixed`` gives no mode.
+    """
+    if not solution.grid.modes:
+        return solution, fixed
+    cuts: dict[Any, Any] = dict(fixed or {})
+    if MODE not in cuts:
+        names = ", ".join(map(repr, solution.grid.modes))
+        raise ValueError(
+            f"a picture over two states shows one mode; choose one of {names}, as in "
+            f"fixed={{'mode': {solution.grid.modes[0]!r}}}"
+        )
+    mode: Any = cuts.pop(MODE)
+    return solution.in_mode(mode), cuts
+
+
+def by_mode(draw: Callable[P, Picture]) -> Callable[P, Picture]:
+    """Decorator of a picture of a solution: over one state it has one line per mode, over two states one mode."""
+
+    @functools.wraps(draw)
+    def drawn(solution: Any, *arguments: Any, **options: Any) -> Picture:
+        fixed: Any = options.get("fixed")
+        modes, cuts = solution.grid.modes, dict(fixed or {})
+        if not modes:
+            return draw(solution, *arguments, **options)  # type: ignore[arg-type]
+        if MODE in cuts or solution.grid.ndim - 1 - len(cuts) != 1:
+            one, rest = of_one_mode(solution, fixed)
+            return draw(one, *arguments, **(options | {"fixed": rest}))  # type: ignore[arg-type]
+        ax, artists = axes_of(options.get("ax")), []
+        for number, name in enumerate(modes):
+            picture: Any = draw(solution.in_mode(number), *arguments, **(options | {"ax": ax}))  # type: ignore[arg-type]
+            line = picture[0]
+            line.set_color(COLOURS[number % len(COLOURS)])
+            line.set_label(name)
+            artists += list(picture)
+        ax.relim()
+        ax.autoscale(axis="y")
+        return Picture([*artists, legend(ax)], ax)
+
+    return drawn

@@ -266,7 +266,8 @@ def _in_program(economy: _Economy, ends: Any, tol: Number) -> Equilibrium:
             "needs their digits.\nPut `with jax.enable_x64(True):` around the call of the transformed function"
         )
     ends = jnp.asarray(ends, float)
-    nothing = jnp.zeros(economy.grid.shape, ends.dtype)
+    like = jax.eval_shape(lambda price: economy.at(price, None).solution.value, ends[0])
+    nothing = jnp.zeros(like.shape, ends.dtype)
 
     def of_price(price: Any, guess: Any) -> tuple[Any, Any]:
         found = economy.at(price, guess)

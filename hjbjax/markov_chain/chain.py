@@ -245,7 +245,7 @@ def evolve(
         u, d = (_at(each, k) for each in actions)
         return _under_policy(problem, grid, u, d, scheme, plan.moments[k])
 
-    found = np.empty((plan.count, *grid.shape))
+    found = np.empty((plan.count, *law.shape))
     with own_settings(x64=True):
         for k, weight, duration, slot in zip(*plan.steps, strict=True):
             rates = rates_at(k) if weight == 0 else _mixed(rates_at(k), rates_at(k + 1), weight)
@@ -348,7 +348,7 @@ def _evolve_traced(problem: Problem, grid: Grid, scheme: Chain, actions: tuple, 
         return (law, found.at[slot].set(law)), None
 
     law = jnp.asarray(law, jnp.result_type(float))
-    start = law, jnp.zeros((plan.count, *grid.shape), law.dtype)
+    start = law, jnp.zeros((plan.count, *law.shape), law.dtype)
     return jax.lax.scan(step, start, jax.tree.map(jnp.asarray, plan.steps))[0][1]
 
 

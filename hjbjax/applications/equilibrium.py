@@ -34,6 +34,7 @@ from hjbjax.iteration.methods import Method
 from hjbjax.markov_chain import chain
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.mode_axis import over_modes, without_modes
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, as_jax, front_door, is_traced, pytree_dataclass
 from hjbjax.problem.rewards import costs_of
@@ -213,7 +214,10 @@ def _is_open(problem_of: Callable, price: Any, grid: Grid) -> bool:
     problem = problem_of(float(price))
     if not isinstance(problem, Problem):
         return False
-    return is_traced(settled(with_any_control(costs_of(problem), grid.ndim), grid.ndim))
+    n = without_modes(grid).ndim
+    joined = over_modes(costs_of(problem), n)
+    n += problem.modes is not None
+    return is_traced(settled(with_any_control(joined, n), n))
 
 
 # --- on the host ---

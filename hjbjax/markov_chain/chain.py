@@ -123,7 +123,8 @@ def stationary_law(
       t: the time, if the problem depends on it.
 
     Returns:
-      The probabilities, shape (*grid), zero at transient nodes; in NumPy at host level.
+      The probabilities, shape (*grid), zero at transient nodes; in NumPy at host level. In a problem with k modes the
+      shape is (k, *grid), as for the value.
 
     Raises:
       ValueError: the problem has a target, where paths end; there are several recurrent classes, or one that is
@@ -140,6 +141,7 @@ def stationary_law(
     return _stationary("stationary_law", problem, grid, policy, disturbance, scheme, t)
 
 
+@with_mode_axis()
 @with_settled_functions
 def stationary_density(
     problem: Problem,
@@ -180,6 +182,7 @@ def stationary_density(
     return density / np.sum(density * grid.volumes())
 
 
+@with_mode_axis()
 @with_settled_functions
 def evolve(
     problem: Problem,

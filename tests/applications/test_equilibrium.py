@@ -131,6 +131,58 @@ def test_the_interest_that_clears_a_market_for_bonds(sigma, discount, mean_rever
     assert found.law[0].sum() > 0.01  # at the borrowing limit
 
 
+# --- two incomes, as modes ---
+
+LADDER = hjb.Grid([-0.5], [5.0], (56,), edges="constrained")
+RUNGS = np.asarray(LADDER.axis(0))
+
+
+def worker(interest, low=0.1, find=1.5, lose=1.0):
+    """Huggett's household, with a job or without one."""
+    income = jnp.stack([low + 0.0 * interest, 0.2 + 0.0 * interest])
+    return hjb.Problem(
+        lambda x, u, mode: interest * x + income[mode] - u, reward=lambda x, u, mode: -1 / u[0],
+        controls=hjb.Box([0.01], [1.0]), discount=0.05, modes=hjb.Modes(("idle", "busy"), rates=[[0, find], [lose, 0]]),
+    )  # fmt: skip
+
+
+def bonds_of_workers(interest, low, find, lose):
+    """The mean wealth with two incomes, as in ``bonds_by_scipy``."""
+    h, income = RUNGS[1] - RUNGS[0], np.array([[low], [0.2]])
+    gained = interest * RUNGS + income
+    switching = csr_array(np.kron([[-find, find], [lose, -lose]], np.eye(56)))
+    v = -1 / gained / 0.05
+    for _ in range(200):
+        forward, backward = np.empty_like(v), np.empty_like(v)
+        forward[:, :-1] = backward[:, 1:] = np.diff(v, axis=1) / h
+        forward[:, -1], backward[:, 0] = gained[:, -1] ** -2.0, gained[:, 0] ** -2.0
+        saving, spending = (gained - np.maximum(slope, 1e-9) ** -0.5 for slope in (forward, backward))  # V may be flat
+        drift = np.where(saving > 0, saving, np.where(spending >= 0, 0, spending))
+        up, down = np.maximum(drift, 0).ravel() / h, np.maximum(-drift, 0).ravel() / h
+        generator = switching + diags_array([-(up + down), up[:-1], down[1:]], offsets=[0, 1, -1])
+        new = spsolve((0.05 * diags_array(np.ones(112)) - generator).tocsc(), -1 / (gained - drift).ravel())
+        change, v = np.abs(new - v.ravel()).max(), new.reshape(v.shape)
+        if change < 1e-12 * np.abs(v).max():
+            break
+    balance = generator.T.toarray()
+    balance[0] = 1.0
+    return np.linalg.solve(balance, np.eye(112)[0]) @ np.tile(RUNGS, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("low", "find", "lose"), [(0.1, 1.5, 1.0), (0.12, 0.8, 0.6)])
+def test_huggetts_economy_with_two_incomes(low, find, lose):
+    found = hjb.equilibrium(
+        lambda r: worker(r, low, find, lose), LADDER, lambda r, solution, law: jnp.sum(law * RUNGS), (-0.01, 0.045)
+    )
+    assert found.law.shape == found.solution.value.shape == (2, 56)
+    np.testing.assert_allclose(found.law.sum(axis=1), np.array([lose, find]) / (find + lose), rtol=1e-9)
+    assert found.law[0, 0] > 0.01  # the idle at the borrowing limit
+    assert found.law[1, 0] < found.law[0, 0]
+    assert found.price == pytest.approx(brentq(bonds_of_workers, -0.01, 0.045, (low, find, lose), xtol=1e-10), abs=1e-6)
+    assert len(found.tried) <= 12
+
+
 # --- derivatives ---
 
 

@@ -210,6 +210,28 @@ def test_a_target_keeps_what_arrives():
     assert law[10] == 0.0  # nothing passes the first node of the target
 
 
+@pytest.mark.parametrize(("find", "lose"), [(1.5, 1.0), (0.2, 0.7)])
+def test_modes_are_the_first_axis_of_a_law(find, lose):
+    """Two modes: the share of the first is s + (1 − s) e^{−(a + b) t}, s = b/(a + b), whatever the state does."""
+    grid, times = hjb.Grid([-2.0], [2.0], (21,)), np.array([0.0, 0.4, 3.0])
+    problem = hjb.Problem(
+        lambda x, u, mode: jnp.stack([1.0, -2.0])[mode] - x, noise=0.4,
+        modes=hjb.Modes(("up", "down"), rates=[[0.0, find], [lose, 0.0]]),
+    )  # fmt: skip
+    start = np.stack([np.eye(21)[10], np.zeros(21)])
+    laws = chain.evolve(problem, grid, None, start, 3.0, times=times)
+    share = lose / (find + lose)
+    exact = share + (1 - share) * np.exp(-(find + lose) * times)
+    np.testing.assert_allclose(laws[:, 0].sum(axis=1), exact, rtol=0, atol=1e-12)
+    law = chain.stationary_law(problem, grid)
+    np.testing.assert_allclose(law.sum(axis=1), [share, 1 - share], rtol=1e-12)
+    generator = chain.generator(problem, grid).toarray()
+    np.testing.assert_allclose(generator.T @ law.ravel(), 0, atol=1e-10)
+    np.testing.assert_allclose(laws[-1].ravel(), expm(3.0 * generator.T) @ start.ravel(), rtol=0, atol=1e-12)
+    # m' = up share − down share − m, in the mean
+    assert law.sum(axis=0) @ np.asarray(grid.axis(0)) == pytest.approx(share - 2 * (1 - share), abs=0.05)
+
+
 @pytest.mark.parametrize("timed", [False, True])
 def test_laws_inside_programs(timed):
     grid, times = hjb.Grid([-2.0], [2.0], (13,)), np.array([0.0, 0.5, 1.0])

@@ -87,26 +87,26 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(state.value.dtype),
             "certificate": assumptions.sentence,
-            **_at_bounds(task, arrays["policy"]),
+            **active_bounds(task.on, arrays["policy"]),
             "versions": {"jax": jax.__version__, "numpy": np.__version__},
         },
     )
 
 
-def _at_bounds(task: Task, policy: np.ndarray | None) -> dict[str, str]:
+def active_bounds(on: Discretisation, policy: np.ndarray | None, when: str = "") -> dict[str, str]:
     """The statistic "bounds": the number of nodes at which a bound holds a control that has a cost of higher order.
 
     A control with an affine cost is at a bound nearly everywhere, so it is left out.
     """
-    box, found = task.problem.controls, []
+    box, found = on.problem.controls, []
     if policy is None or not isinstance(box, Box):
         return {}
     counts = at_bounds(box, policy.reshape(-1, box.dim))
-    names = task.problem.control_names or [f"u{j + 1}" for j in range(box.dim)]
-    for name, pair, curved in zip(names, counts.tolist(), task.on.players.control.curved, strict=True):
+    names = on.problem.control_names or [f"u{j + 1}" for j in range(box.dim)]
+    for name, pair, curved in zip(names, counts.tolist(), on.players.control.curved, strict=True):
         ends = [f"{count:,} at the {end} bound" for count, end in zip(pair, ("lower", "upper"), strict=True) if count]
         found += [f"{name}: {', '.join(ends)}"] if ends and curved else []
-    return {"bounds": f"{'; '.join(found)}, of {task.grid.size:,} nodes"} if found else {}
+    return {"bounds": f"{'; '.join(found)}, of {on.grid.size:,} nodes{when}"} if found else {}
 
 
 def _certified(settled: Settled) -> float | None:

@@ -170,6 +170,16 @@ def test_the_solution_counts_the_nodes_at_a_bound(most):
     assert "bounds" in str(solution)
 
 
+@pytest.mark.parametrize("most", [0.3, 0.8])
+def test_a_march_counts_them_at_its_earliest_time(most):
+    problem = regulator(hjb.Box([-most], [most]), discount=0.0)
+    marched = hjb.march(problem, LINE, 1.0, times=[0.25, 1.0], scheme=hjb.Upwind())
+    count = int(np.sum(marched.policy[0] == most))
+    assert marched.stats["bounds"] == (
+        f"u1: {count} at the lower bound, {count} at the upper bound, of 41 nodes at t = 0.25"
+    )
+
+
 def test_bounds_that_are_not_active_are_not_mentioned():
     assert "bounds" not in hjb.solve(regulator(hjb.Box([-9.0], [9.0])), LINE, scheme=hjb.Upwind()).stats
     bang_bang = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)

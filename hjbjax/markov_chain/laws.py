@@ -11,8 +11,8 @@ Forward in time, uniformisation is exact. With Λ = max Q the matrix P = I + �
     exp(t𝓛*) μ = Σ_k w_k (P*)^k μ,    w_k = e^{−Λt} (Λt)^k / k!.
 
 All terms are non-negative, so nothing cancels. The series is cut where the rest of the weights is below rounding, and
-divided by the sum of the weights that are kept, so Σ μ is conserved to rounding. It takes about Λt products with P, in
-blocks of at most ``LONGEST`` mean jumps, whose first weight does not underflow.
+divided by the sum of the weights that are kept. Finally the sum of μ is set to what it was. The series takes about Λt
+products with P, in blocks of at most ``LONGEST`` mean jumps, whose first weight does not underflow.
 
 The stationary law solves 𝓛*μ = 0 with Σ μ = 1. A change of the rates changes it by δ with
 
@@ -153,7 +153,10 @@ def advanced(jumps: Rates, grid: Grid, law: Field, duration: Number) -> Field:
         _, _, total, weights = jax.lax.fori_loop(0, terms, term, (p, first, first * p, first))
         return total / weights
 
-    return jax.lax.fori_loop(0, blocks.astype(jnp.int32), block, law)
+    found = jax.lax.fori_loop(0, blocks.astype(jnp.int32), block, law)
+    # thousands of products may change the sum by thousands of roundings
+    before, after = jnp.sum(law), jnp.sum(found)
+    return found * jnp.where(after > 0, before / jnp.where(after > 0, after, 1), 1)
 
 
 @jax.custom_jvp

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from hjbjax import geometry
 from hjbjax._version import __version__
 from hjbjax.applications.convergence import convergence_study
+from hjbjax.applications.equilibrium import Equilibrium, equilibrium
 from hjbjax.applications.hinf import hinf_level
 from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.perturbations import perturbation_study
@@ -50,6 +51,7 @@ __all__ = [
     "Direct",
     "Dirichlet",
     "Eno2",
+    "Equilibrium",
     "Explicit",
     "FallbackWarning",
     "FileError",
@@ -82,6 +84,7 @@ __all__ = [
     "chain",
     "convergence_study",
     "dissipation",
+    "equilibrium",
     "estimate",
     "expected_exit_time",
     "filtering",

@@ -222,6 +222,8 @@ def is_bang_bang(problem: Problem, solution: Solution) -> bool:
     if solution.discrete or not isinstance(box, Box):
         return solution.discrete
     # 90 %, because nodes at rest and on the switching curve may have any value
+    if box.unbounded:
+        return False
     policy, near = _finite_controls(solution), 1e-6 * (box.hi - box.lo)
     return policy.size > 0 and bool(np.mean((policy <= box.lo + near) | (policy >= box.hi - near)) > 0.9)
 

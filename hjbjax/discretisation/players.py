@@ -169,7 +169,8 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     affine = (
         drift.affine_in(inputs) and found.switching.affine_in(inputs) and noise.free_of(inputs)
     )  # then the rate of leaving a node is convex
-    at_ends = affine or isinstance(admissible, (Finite, type(None)))
+    # without bounds there are no ends, and the fastest action is known only once it has been chosen
+    at_ends = (affine and not getattr(admissible, "unbounded", False)) or isinstance(admissible, (Finite, type(None)))
     suits = affine and cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball))
     products = frozenset(tuple(j - inputs.start for j in pair) for pair in cost.products_in(inputs))
     groups = _groups(driven, products)

@@ -29,7 +29,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced, pytree_dataclass
 from hjbjax.problem.rewards import refuse_rewards
-from hjbjax.problem.sets import Ball, Box, Finite
+from hjbjax.problem.sets import Ball, Box, Finite, refuse_unbounded
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.solution import Solution
@@ -268,6 +268,8 @@ def _check(
         raise ValueError(f"dissipation: duration is {duration!r}, wanted a finite number > 0")
     if isinstance(random, bool) or not isinstance(random, int) or random < 0:
         raise ValueError(f"dissipation: random is {random!r}, wanted the number of random disturbances, an integer ≥ 0")
+    if random:
+        refuse_unbounded(problem.disturbances, "dissipation", "random disturbances are uniform between them")
     if random and isinstance(problem.disturbances, Finite):
         raise ValueError(
             f"dissipation: the disturbances are {len(problem.disturbances.points)} points, and random ones would run "

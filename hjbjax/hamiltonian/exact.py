@@ -5,6 +5,7 @@ coefficients. From them ``piecewise``, ``ball`` and ``quadratic_program`` find t
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,8 +23,10 @@ from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.piecewise import Kinked, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.quadratic_program import Program
 from hjbjax.hamiltonian.search import Action
+from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.sets import Ball, Box
+from hjbjax.problem.sets import Ball, Box, refuse_unbounded
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Verdict
 from hjbjax.tracing import components
 
@@ -127,7 +130,8 @@ def _in_box(part: _Part, group: Sequence[int]) -> Action:
     admissible, player = part.player.admissible, part.player
     assert isinstance(admissible, Box)
     pieces = [part.gain(i, group) for i in shared(player.driven, group)]
-    lo, hi, slope = ([each[j] for j in group] for each in (admissible.lo, admissible.hi, part.linear))
+    ends = sets.finite_ends(admissible, part.hamiltonian.on.dtype)
+    lo, hi, slope = ([each[j] for j in group] for each in (*ends, part.linear))
     bend, curved = [part.square(j) for j in group], any(player.curved[j] for j in group)
     if len(group) == 1:
         return [piecewise_input(player.sign, lo[0], hi[0], slope[0], bend[0], pieces, curved=curved)]
@@ -289,3 +293,66 @@ def _is_concave(on: Discretisation) -> Verdict:
             rows = [jnp.stack([jnp.broadcast_to(entry, on.grid.shape) for entry in row]) for row in bend]
             found |= ~jnp.all(quadratic_program.is_convex(jnp.stack(rows)))
     return found
+
+
+# --- infinite bounds ---
+
+
+def check_unbounded(on: Discretisation, *, relaxes: bool = False) -> None:
+    """Refuse infinite bounds of an input whose optimum is not found by a formula, or may be infinite; host level.
+
+    ``relaxes``: the method needs the largest rate of all actions, as value iteration does.
+
+    Raises:
+      ValueError: the optimum is searched, or is a quadratic program; the cost has no positive curvature in the input;
+        or the method needs the largest rate.
+    """
+    if relaxes:
+        for admissible in (on.problem.controls, on.problem.disturbances):
+            refuse_unbounded(admissible, "ValueIteration()", "its steps divide by the largest rate of all actions")
+    for name, player in zip(("controls", "disturbances"), on.players.both, strict=True):
+        if not isinstance(player.admissible, Box) or not player.admissible.unbounded:
+            continue
+        lo, hi = np.asarray(player.admissible.lo), np.asarray(player.admissible.hi)
+        inputs = [int(j) for j in np.flatnonzero(np.isinf(lo) | np.isinf(hi))]
+        reason = _unanswered(on, player, inputs)
+        if reason:
+            raise ValueError(
+                f"Problem.{name}: got infinite bounds, {player.admissible}, but {reason}.\n"
+                "Give finite bounds, or a drift affine and a cost quadratic with positive curvature in the input,\n"
+                "without products with other inputs"
+            )
+
+
+def _unanswered(on: Discretisation, player: Player, inputs: list[int]) -> str | None:
+    """The reason why the optimum over some inputs needs their bounds; None if there is none."""
+    programs = {j for group, program in zip(player.groups, player.programs, strict=True) for j in group if program}
+    word = "cost" if player.sign > 0 else "gain of the disturbance"
+    if not player.exact or not on.players.exact:
+        return "the optimum is searched between the bounds"
+    if programs & set(inputs):
+        return f"the optimum over input {min(programs & set(inputs))} is a quadratic program with other inputs"
+    straight = [j for j in inputs if not player.curved[j]]
+    if straight:
+        return f"the {word} is affine in input {straight[0]}, so the optimum is infinite"
+    with own_settings(x64=True):
+        curvature = np.asarray(_curvature(on, player.sign > 0))
+    for j in inputs:
+        flat = ~(player.sign * curvature[j] > 0)
+        if flat.any():
+            first = tuple(int(i) for i in np.argwhere(flat)[0])
+            return (
+                f"the {word} has no curvature in input {j} at {int(flat.sum())} nodes, the first "
+                f"x = {np.asarray(on.grid.state(first)).tolist()}"
+            )
+    return None
+
+
+@functools.partial(jax.jit, static_argnames="control")
+def _curvature(on: Discretisation, control: bool) -> jax.Array:
+    """The coefficient of the square of each input of one player in the cost, (m, *grid)."""
+    u, d = ([jnp.zeros((), on.dtype)] * len(player.driven) for player in on.players.both)
+    player = on.players.control if control else on.players.disturbance
+    _, quadratic = _cost_coefficients(on, player, on.problem.arguments(on.coordinates(), u, d, on.t))
+    zero = jnp.zeros((), on.dtype)
+    return jnp.stack([jnp.broadcast_to(quadratic.get((j, j), zero), on.grid.shape) for j in range(len(player.driven))])

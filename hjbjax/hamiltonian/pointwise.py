@@ -26,7 +26,7 @@ import numpy as np
 from hjbjax.hamiltonian.ball import least_in_ball
 from hjbjax.hamiltonian.search import Action, enumerate_actions, refine
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, samples, spacing
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, finite_ends, samples, spacing
 from hjbjax.problem.types import Control, Costate, DType, Number, Scalar, State
 from hjbjax.tracing import dependence
 
@@ -149,7 +149,8 @@ def least(
     zero = jnp.zeros(admissible.dim, dtype)
     slope, square = jax.grad(energy)(zero), jnp.diagonal(jax.hessian(energy)(zero)) / 2
     if isinstance(admissible, Box):
-        return _in_box(jnp.asarray(admissible.lo, dtype), jnp.asarray(admissible.hi, dtype), slope, square)
+        lo, hi = (jnp.asarray(bound, dtype) for bound in finite_ends(admissible, dtype))
+        return _in_box(lo, hi, slope, square)
     return jnp.stack(least_in_ball(jnp.asarray(admissible.radius, dtype), list(slope), list(square)))
 
 

@@ -1,10 +1,12 @@
-"""Exports of the Markov chain: generator, transition matrix, stationary density, decision problem.
+"""The Markov chain: generator, transition matrix, stationary and transient laws, and exports as a decision problem.
 
-Everything here runs on the host in float64, with the nodes in C order. ``rates`` in ``discretisation`` has the
-equations of the jump rates c. Let Q = Σ c be the rate at which the chain leaves a node. The generator 𝓛 has the rates c
+Everything here runs on the host in float64, with the nodes in C order. ``stationary_law`` and ``evolve`` also run
+inside ``jit`` and ``vmap``, and can be differentiated. ``rates`` in ``discretisation`` has the equations of the jump
+rates c. Let Q = Σ c be the rate at which the chain leaves a node. The generator 𝓛 has the rates c
 off the diagonal and −Q on it. The transition matrix with one time step Δt for all nodes is I + Δt 𝓛.
 """
 
+import functools
 from typing import Any
 
 import jax
@@ -16,11 +18,11 @@ from hjbjax.discretisation.discretisation import Chain, Discretisation
 from hjbjax.discretisation.posing import with_mode_axis, without_horizon
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.markov_chain import decision_process, stationary_law
+from hjbjax.markov_chain import decision_process, laws
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import cast
+from hjbjax.problem.pytree import as_one_program, cast, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -94,6 +96,53 @@ def matrix(
 
 @with_mode_axis()
 @with_settled_functions
+def stationary_law(
+    problem: Problem,
+    grid: Grid,
+    policy: Any = None,
+    *,
+    disturbance: Any = None,
+    scheme: Chain = Upwind(),
+    t: float = 0.0,
+) -> Any:
+    """The stationary law of the chain under a policy: 𝓛*μ = 0 with Σ μ = 1, one probability per node.
+
+    Means under the law are sums: ``np.sum(law * values)``. A mass at one point, such as the households at a borrowing
+    limit, is the probability of its node. ``stationary_density`` divides the law by the cells.
+
+    Computed by a sparse LU factorisation. Inside ``jit``, ``vmap`` and ``grad`` the law is traced, and has a first
+    derivative with respect to every number in the problem, the grid and the policy, at the cost of one more
+    factorisation. It is NaN there if one of the errors below would be raised.
+
+    Args:
+      problem: the problem without a target; only drift and noise are used.
+      grid: the grid.
+      policy: the control at every node, shape (*grid, m); ``None`` without controls.
+      disturbance: the disturbance at every node, shape (*grid, l), in a game.
+      scheme: the chain that defines the rates.
+      t: the time, if the problem depends on it.
+
+    Returns:
+      The probabilities, shape (*grid), zero at transient nodes; in NumPy at host level. In a problem with k modes the
+      shape is (k, *grid), as for the value.
+
+    Raises:
+      ValueError: the problem has a target, where paths end; there are several recurrent classes, or one that is
+        connected only by rates of the size of rounding, so that the distribution depends on the start; or ``generator``
+        raises.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> spend = hjb.Problem(lambda x, u: -x, noise=lambda x, u: 0.1 * x)  # nothing leaves the end at zero
+      >>> law = stationary_law(spend, Grid([0.0], [1.0], (11,)))
+      >>> float(law[0])
+      1.0
+    """
+    return _stationary("stationary_law", problem, grid, policy, disturbance, scheme, t)
+
+
+@with_mode_axis()
+@with_settled_functions
 def stationary_density(
     problem: Problem,
     grid: Grid,
@@ -103,21 +152,16 @@ def stationary_density(
     scheme: Chain = Upwind(),
     t: float = 0.0,
 ) -> np.ndarray:
-    """The stationary density of the chain under a policy: 𝓛*p = 0, with integral one.
+    """The stationary density of the chain under a policy: ``stationary_law`` per volume, with integral one.
 
-    It is the stationary probability of each node divided by the volume of its cell, and scaled so that
+    It is the probability of each node divided by the volume of its cell, and scaled so that
     ``np.sum(density * grid.volumes())`` is one. The cell of a node on a wall that reflects noise is half
     as wide. At an end of an axis without noise it is a whole cell, where drift enters and leaves at the rate |f|/h, as
     inside the box. The density is second order, also at walls, where central differences are monotone, and first order
-    elsewhere. It is computed by a sparse LU factorisation, see ``stationary_law``. Arguments as for ``generator``.
+    elsewhere. Host level. Arguments and errors as for ``stationary_law``.
 
     Returns:
       The density at the nodes, shape (*grid), in 1/(units of the states); zero at transient nodes.
-
-    Raises:
-      ValueError: the problem has a target, where paths end; there are several recurrent classes, or one that is
-        connected only by rates of the size of rounding, so that the distribution depends on the start; or ``generator``
-        raises.
 
     Example:
       >>> import numpy as np
@@ -126,23 +170,91 @@ def stationary_density(
       >>> float(round(density[80], 3)), float(round(np.sum(density * grid.volumes()), 12))  # 1/√π
       (0.564, 1.0)
     """
-    if problem.target is not None:  # the stationary law would be a point mass on the target
-        raise ValueError(
-            "stationary_density: got a problem with a target, where paths end, so no density is stationary; leave "
-            "it out, or use hjb.reach_probability or hjb.expected_exit_time"
-        )
-    jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
-    moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
-    probabilities = decision_process.single_law(stationary_law.classes(moves), moves, grid)
+    law = _stationary("stationary_density", problem, grid, policy, disturbance, scheme, t)
     u, d, _ = decision_process.policy_components(problem, grid, policy, disturbance)
     with own_settings(x64=True):
         on = Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64), t)
         noise = on.diffusion(*cast((u, d), np.float64))
-        density = probabilities.reshape(grid.shape) / grid.volumes()
+        density = law / grid.volumes()
         for axis in range(grid.ndim):
             still = np.asarray(stencil.walls(grid, axis) & ~(jnp.asarray(noise.get((axis, axis), 0.0)) > 0))
             density = np.where(still, density / 2, density)
     return density / np.sum(density * grid.volumes())
+
+
+@with_mode_axis()
+@with_settled_functions
+def evolve(
+    problem: Problem,
+    grid: Grid,
+    policy: Any,
+    law: Any,
+    horizon: float,
+    *,
+    times: Any = None,
+    policy_times: Any = None,
+    disturbance: Any = None,
+    scheme: Chain = Upwind(),
+) -> Any:
+    """The law of the chain forward in time under a policy: dμ/dt = 𝓛*μ from ``law`` at t = 0.
+
+    Non-negative, with the same sum. Without ``policy_times`` the result is exp(t𝓛*) μ to rounding, by uniformisation,
+    for any horizon; the cost is about ``horizon`` · max Q products with the transition matrix. A policy that
+    depends on time, as from ``march``, is given at ``policy_times``. The rates are interpolated linearly between them,
+    and constant during a step between two times, so the error is second order in the distance of the times. Nodes on
+    the target, and nodes without an action, keep their mass.
+
+    Args:
+      problem: the problem; only drift, noise and target are used.
+      grid: the grid.
+      policy: the control at every node, shape (*grid, m), or (k, *grid, m) at k ``policy_times``; ``None`` without
+        controls.
+      law: μ at t = 0, one non-negative number per node, shape (*grid); a density times the cells.
+      horizon: T > 0, in units of time.
+      times: the times of the result, increasing, in [0, horizon]; ``None`` is (horizon,).
+      policy_times: k increasing times that cover [0, horizon], such as ``solution.times`` of a march. Required if the
+        problem depends on time.
+      disturbance: the disturbance in a game, in the form of ``policy``.
+      scheme: the chain that defines the rates.
+
+    Returns:
+      The laws, shape (number of times, *grid); in NumPy at host level. Inside ``jit`` and ``vmap`` they are traced, and
+      forward derivatives, as of ``jax.jvp`` and ``jax.jacfwd``, pass. ``horizon`` and all times must be known numbers.
+      The result is NaN there if ``generator`` would raise.
+
+    Raises:
+      ValueError: an argument is invalid, or ``generator`` raises.
+
+    Example:
+      >>> import numpy as np
+      >>> grid = Grid([-4.0], [4.0], (81,))  # noise 1 from the middle: the variance is the time
+      >>> wander = evolve(Problem(lambda x, u: 0 * x, noise=1.0), grid, None, np.eye(81)[40], 1.0, times=[0.5, 1.0])
+      >>> (wander @ np.asarray(grid.axis(0)) ** 2).round(2).tolist()
+      [0.5, 1.0]
+    """
+    plan = laws.plan_steps(horizon, times, policy_times)
+    if problem.time_dependent and policy_times is None:
+        raise ValueError(
+            "evolve: got a time-dependent problem without policy_times, wanted the times at which its rates are "
+            "evaluated;\npass policy_times=solution.times with the policy of a march, or np.linspace(0, horizon, k)"
+        )
+    if is_traced(problem, grid, policy, disturbance, law):
+        return _evolve_traced(problem, grid, scheme, (policy, disturbance), law, plan)
+    law = laws.checked(law, grid)
+    actions = _with_times((policy, disturbance), plan)
+
+    @functools.lru_cache(2)  # each time but the first and the last belongs to two steps
+    def rates_at(k: int) -> Rates:
+        u, d = (_at(each, k) for each in actions)
+        return _under_policy(problem, grid, u, d, scheme, plan.moments[k])
+
+    found = np.empty((plan.count, *law.shape))
+    with own_settings(x64=True):
+        for k, weight, duration, slot in zip(*plan.steps, strict=True):
+            rates = rates_at(k) if weight == 0 else _mixed(rates_at(k), rates_at(k + 1), weight)
+            law = _advanced(rates, grid, law, duration)
+            found[slot] = law
+    return found
 
 
 @without_horizon
@@ -200,6 +312,91 @@ def transition_arrays(
     return (costs if problem.payoff == COST else 0 - costs, *chain)
 
 
+def _stationary(name: str, problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: Any) -> Any:
+    """The stationary law, shape (*grid); ``name`` is the function named in a message."""
+    if problem.target is not None:  # the stationary law would be a point mass on the target
+        raise ValueError(
+            f"{name}: got a problem with a target, where paths end, so no law is stationary; leave "
+            "it out, or use hjb.reach_probability or hjb.expected_exit_time"
+        )
+    if is_traced(problem, grid, policy, disturbance, t):
+        return _stationary_traced(problem, grid, policy, disturbance, scheme, t)
+    jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
+    moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
+    return decision_process.single_law(moves, grid, name).reshape(grid.shape)
+
+
+@as_one_program
+def _stationary_traced(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: Any) -> jax.Array:
+    """The stationary law inside a JAX transformation; NaN instead of an error."""
+    return laws.stationary(_rates_in_program(problem, grid, (policy, disturbance), scheme, t), grid)
+
+
+@as_one_program
+def _evolve_traced(problem: Problem, grid: Grid, scheme: Chain, actions: tuple, law: Any, plan: laws.Plan) -> jax.Array:
+    """The laws at the times of a plan inside a JAX transformation; NaN instead of an error."""
+    actions = _with_times(actions, plan)
+    moments = jnp.asarray(plan.moments)
+
+    def rates_at(k: Any) -> Rates:
+        return _rates_in_program(problem, grid, tuple(_at(each, k) for each in actions), scheme, moments[k])
+
+    only = rates_at(0) if len(plan.moments) == 1 else None
+
+    def step(carry: tuple, entry: tuple) -> tuple[tuple, None]:
+        law, found = carry
+        k, weight, duration, slot = entry
+        rates = only or _mixed(rates_at(k), rates_at(k + 1), weight)
+        law = laws.advanced(rates, grid, law, duration)
+        return (law, found.at[slot].set(law)), None
+
+    law = jnp.asarray(law, jnp.result_type(float))
+    start = law, jnp.zeros((plan.count, *law.shape), law.dtype)
+    return jax.lax.scan(step, start, jax.tree.map(jnp.asarray, plan.steps))[0][1]
+
+
+_advanced = jax.jit(laws.advanced)
+
+
+def _mixed(first: Rates, second: Rates, weight: Any) -> Rates:
+    """The rates between two times, the mean with ``weight`` for the second."""
+    pairs = zip(first.values, second.values, strict=True)
+    return Rates(first.offsets, tuple((1 - weight) * a + weight * b for a, b in pairs))
+
+
+def _with_times(actions: tuple, plan: laws.Plan) -> tuple:
+    """The actions of control and disturbance with an axis of times in front; None if there is no such player."""
+    found = []
+    for name, action in zip(("policy", "disturbance"), actions, strict=True):
+        kept = action if action is None or is_traced(action) else np.asarray(action)
+        if kept is not None and plan.timed and np.shape(kept)[:1] != (len(plan.moments),):
+            raise ValueError(
+                f"evolve: got a {name} of shape {kept.shape} for {len(plan.moments)} policy_times; wanted one {name} "
+                "per time, shape (k, *grid, m)"
+            )
+        found.append(kept if kept is None or plan.timed else kept[None])
+    return tuple(found)
+
+
+def _at(action: Any, k: Any) -> Any:
+    """A player's actions at one time."""
+    return None if action is None else action[k]
+
+
+def _rates_in_program(problem: Problem, grid: Grid, actions: tuple, scheme: Chain, t: Any) -> Rates:
+    """The rates under a policy inside a JAX transformation; NaN if they are refused at host level."""
+    _refuse_ends(grid)
+    u, d, active = decision_process.policy_components(problem, grid, *actions)
+    dtype = np.dtype(jnp.result_type(float))
+    on, u, d = cast((Discretisation(problem, grid, scheme, dtype, t), u, d), dtype)
+    if problem.target is not None:
+        active = active & ~(on.level <= 0)
+    jumps, _, lacking, leaving = _evaluate(on, u, d, jnp.finfo(dtype).eps)
+    faulty = jnp.any(active & (lacking | leaving | ~jnp.isfinite(jumps.total())))
+    values = [jnp.where(faulty, jnp.nan, jnp.where(active, c, 0)).astype(dtype) for c in jumps.values]
+    return Rates(jumps.offsets, tuple(values))
+
+
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
     """The rates under a policy; zero on the target and at nodes without an action."""
     checks.check_indices(grid)
@@ -221,12 +418,7 @@ def _checked(
     Refuses rates and costs that cannot be exported.
     """
     grid = on.grid
-    checks.refuse_prescribed(grid, "chain", "whose payments do not fit into a table of rates and running costs")
-    if grid.sides("open"):
-        raise ValueError(
-            "chain: a grid with open ends has no chain: extrapolating the value beyond them gives negative "
-            "probabilities; choose edges='projected' or 'constrained'"
-        )
+    _refuse_ends(grid)
     with own_settings(x64=True):
         jumps, cost, lacking, leaving = jax.device_get(_evaluate(*cast((on, u, d), np.float64), eps))
     decision_process.refuse(f"the running {on.problem.payoff} is not finite", active & ~np.isfinite(cost), grid)
@@ -236,6 +428,16 @@ def _checked(
     decision_process.refuse("the noise is correlated more than the spacings allow", active & lacking, grid)
     kept = Rates(jumps.offsets, tuple(np.where(active, c, 0) for c in jumps.values))
     return kept, np.where(active, cost, 0), active & leaving
+
+
+def _refuse_ends(grid: Grid) -> None:
+    """Refuse ends at which the scheme is not a chain."""
+    checks.refuse_prescribed(grid, "chain", "whose payments do not fit into a table of rates and running costs")
+    if grid.sides("open"):
+        raise ValueError(
+            "chain: a grid with open ends has no chain: extrapolating the value beyond them gives negative "
+            "probabilities; choose edges='projected' or 'constrained'"
+        )
 
 
 @jax.jit

@@ -5,11 +5,11 @@ exports, and lays out their arrays.
 """
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
@@ -58,24 +58,27 @@ def refuse(what: str, where: Mask, grid: Grid, name: str = "chain") -> None:
         raise ValueError(f"{name}: {what} at {int(np.sum(where))} nodes, the first {first} with state {state}")
 
 
-def single_law(classes: list[np.ndarray], generator: "csr_array", grid: Grid) -> np.ndarray:
+def single_law(generator: "csr_array", grid: Grid, name: str) -> np.ndarray:
     """The stationary probabilities of a chain with one recurrent class, shape (S,).
+
+    ``name`` is the function named in a message.
 
     Raises:
       ValueError: there is more than one class, or rounding may split the class.
     """
     why = "where the chain is found after a long time depends on where it starts"
     fix = "connect them by noise, or restrict the box to one part"
+    classes = stationary_law.classes(generator)
     if len(classes) > 1:
         first = [np.array2string(grid.state(np.unravel_index(c[0], grid.shape)), separator=", ") for c in classes[:2]]
         raise ValueError(
-            f"stationary_density: got {len(classes)} recurrent classes, wanted one: {why};\nthe first two contain the "
+            f"{name}: got {len(classes)} recurrent classes, wanted one: {why};\nthe first two contain the "
             f"states {first[0]} and {first[1]}, {len(classes[0])} and {len(classes[1])} nodes; {fix}"
         )
     probabilities, error = stationary_law.law(generator, classes[0])
     if error > stationary_law.LARGEST_ERROR:
         raise ValueError(
-            f"stationary_density: parts of the box exchange so little that rounding may move {error:.2g} of the "
+            f"{name}: parts of the box exchange so little that rounding may move {error:.2g} of the "
             f"probability between them, wanted at most {stationary_law.LARGEST_ERROR:g}:\n{why}; {fix}"
         )
     return probabilities
@@ -93,24 +96,25 @@ def target(problem: Problem, grid: Grid, t: float = 0.0) -> tuple[np.ndarray, np
     return inside, paid
 
 
-def policy_components(
-    problem: Problem, grid: Grid, policy: ArrayLike | None, disturbance: ArrayLike | None
-) -> tuple[list, list, np.ndarray]:
+def policy_components(problem: Problem, grid: Grid, policy: Any, disturbance: Any) -> tuple[list, list, Any]:
     """The components of both players' policies, each (*grid), and the nodes where no entry is NaN."""
+    xp: Any = jnp if is_traced(policy, disturbance) else np
     u = _entries(policy, problem.controls, grid, "policy")
     d = _entries(disturbance, problem.disturbances, grid, "disturbance")
     # a solution marks nodes without an action by NaN; drift and cost are evaluated there with zeros
-    active = ~np.any(np.isnan(np.concatenate([u, d], axis=-1)), axis=-1)
-    return *(list(np.moveaxis(np.where(active[..., None], action, 0), -1, 0)) for action in (u, d)), active
+    active = ~xp.any(xp.isnan(xp.concatenate([u, d], axis=-1)), axis=-1)
+    return *(list(xp.moveaxis(xp.where(active[..., None], action, 0), -1, 0)) for action in (u, d)), active
 
 
-def _entries(action: ArrayLike | None, admissible: AdmissibleSet | None, grid: Grid, name: str) -> np.ndarray:
-    """One player's action at every node, (*grid, m); m = 0 if there is no such player."""
+def _entries(action: Any, admissible: AdmissibleSet | None, grid: Grid, name: str) -> Any:
+    """One player's action at every node, (*grid, m); m = 0 if there is no such player. In NumPy unless traced."""
     wanted = (*grid.shape, 0 if admissible is None else admissible.dim)
-    entries = np.zeros(wanted) if action is None and admissible is None else np.asarray(action, np.float64)
+    if action is None and admissible is None:
+        return np.zeros(wanted)
+    entries = action if is_traced(action) else np.asarray(action, np.float64)
     if entries.shape != wanted:
         raise ValueError(f"chain: got a {name} of shape {entries.shape}, wanted {wanted}: one action per node")
-    if np.any(np.isinf(entries)):
+    if not is_traced(entries) and np.any(np.isinf(entries)):
         raise ValueError(f"chain: the {name} is infinite at some node; wanted numbers, or NaN where there is no action")
     return entries
 

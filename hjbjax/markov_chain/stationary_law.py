@@ -76,6 +76,39 @@ def law(generator: "csr_array", states: np.ndarray) -> tuple[np.ndarray, float]:
     return probabilities, error / total
 
 
+def deviation(generator: "csr_array", right: np.ndarray, law: np.ndarray, *, transposed: bool) -> np.ndarray:
+    """Solve (Λ μ 1ᵀ − 𝓛*) δ = r, or the transposed system, with Λ the fastest rate; NaN if it is singular.
+
+    With the law μ of the only recurrent class the matrix is regular. The rank-one term is eliminated: 𝓛*μ = 0 and
+    1ᵀ𝓛* = 0, so Σ δ = Σ r/Λ, and −𝓛*δ = r − μ Σ r without the row and the column of the peak of μ.
+
+    Args:
+      generator: a SciPy sparse array of shape (S, S), per unit time.
+      right: r, shape (S,).
+      law: μ, shape (S,).
+      transposed: solve (Λ 1 μᵀ − 𝓛) y = r instead.
+    """
+    from scipy.sparse.linalg import splu
+
+    if not (np.all(np.isfinite(law)) and np.all(np.isfinite(right))):
+        return np.full(right.shape, np.nan)
+    peak, fastest = int(np.argmax(law)), -generator.diagonal().min() or 1.0
+    rest = np.delete(np.arange(law.size), peak)
+    if not rest.size:
+        return right / fastest
+    matrix = -generator.tocsr()[rest][:, rest].T.tocsc()
+    total = law @ right if transposed else right.sum()
+    found = np.zeros(law.size)
+    left = right - (total if transposed else total * law)
+    try:
+        found[rest] = splu(matrix).solve(left[rest], "T" if transposed else "N")
+    except RuntimeError:  # exactly singular
+        return np.full(right.shape, np.nan)
+    if transposed:
+        return found + (total / fastest - law @ found)
+    return found + (total / fastest - found.sum()) * law
+
+
 def _from(outflow: "csc_array", pinned: int) -> tuple[np.ndarray, float]:
     """μ with μ = 1 at ``pinned``, and the bound on the sum of its rounding errors."""
     from scipy.sparse.linalg import splu

@@ -146,7 +146,8 @@ def span_of(solution: "Solution", input: int) -> float:
     problem = described(solution).problem
     controls = None if problem is None else problem.controls
     if isinstance(controls, Box):
-        return float(controls.hi[input] - controls.lo[input])
+        span = float(controls.hi[input] - controls.lo[input])
+        return span if np.isfinite(span) else 0.0
     return 2 * float(controls.radius) if isinstance(controls, Ball) else 0.0
 
 

@@ -54,7 +54,7 @@ INTERRUPT = re.compile(r"\nKeyboardInterrupt\b.*\s*\Z")  # end of a traceback in
 REMEMBERED = 256  # the number of most recent answers to keep per function; their keys hold functions and arrays
 
 
-@dataclass_transform(frozen_default=True, eq_default=False)
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(dataclasses.field,))
 def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) -> Callable[[type[T]], type[T]]:
     """Class decorator: a frozen dataclass, registered as a pytree node.
 

@@ -4,6 +4,7 @@
 are leaves, so a wider box does not recompile.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -11,9 +12,10 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import known, numbers, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, known, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, DType, Number
 
+SPREAD = 4.0  # samples of an unbounded input are sinh(4 s), 0 ≤ s ≤ 1: up to 27 beyond its finite bound, or zero
 SLACK = 1e-6  # relative to the size of a set: eight roundings of float32, in which a control may have been computed
 
 
@@ -25,21 +27,33 @@ def _finite_numbers(value: object, name: str) -> Array:
     return array
 
 
+def _bounds(value: object, name: str, infinite: float) -> Array:
+    """Bounds as an array; refused if NaN, or infinite with the sign that leaves nothing."""
+    array = numbers(value, name)
+    if isinstance(array, np.ndarray) and np.any(np.isnan(array) | (np.isinf(array) & (array != infinite))):
+        raise ValueError(f"{name}: got {value!r}, wanted finite numbers, or {infinite:g} where there is no bound")
+    return array
+
+
 def _is_count(value: object) -> bool:
     """True if a value is a positive integer; booleans do not count."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and int(value) >= 1
 
 
-@pytree_dataclass()
+@pytree_dataclass(static=("unbounded",))
 class Box:
     """The box lo ≤ u ≤ hi.
+
+    A bound may be infinite if the optimum is found by a formula: the drift affine in this input, the noise independent
+    of it, and the cost quadratic in it with a positive curvature. Consumption and effort then need no invented limit.
+    Solvers refuse infinite bounds elsewhere.
 
     Args:
       lo: lower bounds, shape (m,), in the units of each input; for one input, a number is enough.
       hi: upper bounds, in the same form.
 
     Raises:
-      ValueError: the bounds differ in length, are not finite, or leave no admissible control.
+      ValueError: the bounds differ in length, are NaN, or leave no admissible control.
 
     Example:
       >>> Box([-1.0], [1.0]).grid(3).points.tolist()
@@ -48,13 +62,15 @@ class Box:
 
     lo: Any
     hi: Any = None
+    # static, because the programs for finite bounds must not change; False if the numbers are traced
+    unbounded: bool = dataclasses.field(init=False, default=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.hi is None:
             pair = np.shape(self.lo) == (2,)
             cure = f"Box({self.lo[0]!r}, {self.lo[1]!r})" if pair else "Box([-1.0], [1.0])"
             raise TypeError(f"Box: got only lo = {self.lo!r}, wanted both bounds, as in hjb.{cure}")
-        lo, hi = _finite_numbers(self.lo, "Box.lo"), _finite_numbers(self.hi, "Box.hi")
+        lo, hi = _bounds(self.lo, "Box.lo", -np.inf), _bounds(self.hi, "Box.hi", np.inf)
         if np.ndim(lo) == np.ndim(hi) == 0:
             lo, hi = lo.reshape(1), hi.reshape(1)
         if np.ndim(lo) != 1 or np.shape(lo) != np.shape(hi) or np.size(lo) == 0:
@@ -64,6 +80,8 @@ class Box:
             raise ValueError(f"Box: no admissible control: input {axis} has lo = {lo[axis]:g} > hi = {hi[axis]:g}")
         object.__setattr__(self, "lo", lo)
         object.__setattr__(self, "hi", hi)
+        known = [bound for bound in (lo, hi) if isinstance(bound, np.ndarray)]
+        object.__setattr__(self, "unbounded", any(bool(np.any(np.isinf(bound))) for bound in known))
 
     @property
     def dim(self) -> int:
@@ -78,6 +96,8 @@ class Box:
         counts = tuple(num) if isinstance(num, (Sequence, np.ndarray)) else (num,) * self.dim
         if len(counts) != self.dim or not all(_is_count(n) for n in counts):
             raise ValueError(f"Box.grid: got {num!r}, wanted a positive integer or {self.dim} of them")
+        if self.unbounded:
+            raise ValueError(f"Box.grid: got infinite bounds, {self}, which cannot be sampled; give finite bounds")
         # indices k, shape (K, m), in the order of nested loops: the last input changes fastest
         rows = np.array(list(itertools.product(*(range(int(n)) for n in counts))), dtype=np.float64)
         last = np.maximum(np.asarray(counts, dtype=np.float64) - 1, 1)  # a single value is lo, not 0/0
@@ -162,7 +182,7 @@ def samples(admissible: AdmissibleSet, budget: int) -> Array:
         return admissible.points
     if isinstance(admissible, Box):
         per_input = _values_an_input(admissible, budget)
-        return admissible.grid(per_input).points
+        return _spread(admissible, per_input) if admissible.unbounded else admissible.grid(per_input).points
     unit = _unit_ball(admissible.dim, budget)
     return known(admissible.radius) * unit
 
@@ -170,6 +190,55 @@ def samples(admissible: AdmissibleSet, budget: int) -> Array:
 def _values_an_input(box: Box, budget: int) -> int:
     """The m-th root of the budget, made odd; at least both ends and the middle."""
     return max(3, round(budget ** (1 / box.dim)) // 2 * 2 + 1)
+
+
+def _spread(box: Box, per_input: int) -> Array:
+    """Values of a box with infinite bounds, ``per_input`` for each input, shape (K, m).
+
+    They lie closest together near a finite bound, or near zero, and span several powers of ten. Their optimum is never
+    used: they show checks what the functions do for small and for large actions.
+    """
+    xp: Any = jnp if is_traced(box.lo, box.hi) else np
+    lo, hi = xp.asarray(box.lo), xp.asarray(box.hi)
+    share = np.linspace(0, 1, per_input)[:, None]
+    from_lo, from_hi, both = (np.sinh(SPREAD * each) for each in (share, 1 - share, 2 * share - 1))
+    below, above = xp.isfinite(lo), xp.isfinite(hi)
+    low, high = xp.where(below, lo, 0), xp.where(above, hi, 0)
+    one_sided = xp.where(below, low + from_lo, xp.where(above, high - from_hi, both))
+    values = xp.where(below & above, low * (1 - share) + high * share, one_sided)
+    rows = np.array(list(itertools.product(range(per_input), repeat=box.dim)))
+    return values[rows, np.arange(box.dim)]
+
+
+def finite_ends(box: Box, dtype: DType) -> tuple[Any, Any]:
+    """lo and hi as finite numbers; infinite ones are so large that a convex quadratic is never least there."""
+    if not box.unbounded:
+        return box.lo, box.hi
+    largest = float(np.finfo(dtype).max) ** 0.25  # its square times a coefficient must be finite
+    lo, hi = (jnp.clip(jnp.asarray(bound, dtype), -largest, largest) for bound in (box.lo, box.hi))
+    return lo, hi
+
+
+def at_bounds(box: Box, u: np.ndarray) -> np.ndarray:
+    """The number of controls, rows of u (K, m), at the lower and at the upper bound of each input, shape (m, 2)."""
+    lo, hi = np.asarray(box.lo), np.asarray(box.hi)
+    slack = SLACK * _size(lo, hi)
+    return np.stack([np.sum(u <= lo + slack, axis=0), np.sum(u >= hi - slack, axis=0)], axis=-1)
+
+
+def _size(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """The size of a box along each input: of its finite bounds and their distance."""
+    sizes = np.stack([np.abs(lo), np.abs(hi), hi - lo])
+    return np.max(np.where(np.isfinite(sizes), sizes, 0), axis=0)
+
+
+def refuse_unbounded(admissible: AdmissibleSet | None, caller: str, why: str) -> None:
+    """Refuse a box with infinite bounds in a function that requires bounds, with the reason."""
+    if isinstance(admissible, Box) and admissible.unbounded:
+        raise ValueError(
+            f"{caller}: got infinite bounds, {admissible}; wanted finite bounds: {why}.\n"
+            "Give bounds that are wide enough not to matter"
+        )
 
 
 def _unit_ball(dim: int, budget: int) -> np.ndarray:
@@ -191,7 +260,7 @@ def holds(admissible: AdmissibleSet, u: Array) -> np.ndarray:
     """True for each control (..., m) inside a set of known numbers, up to rounding in float32; shape (...)."""
     if isinstance(admissible, Box):
         lo, hi = np.asarray(admissible.lo), np.asarray(admissible.hi)
-        slack = SLACK * np.maximum(np.maximum(np.abs(lo), np.abs(hi)), hi - lo)
+        slack = SLACK * _size(lo, hi)
         return np.all((u >= lo - slack) & (u <= hi + slack), axis=-1)
     if isinstance(admissible, Ball):
         return np.linalg.norm(u, axis=-1) <= np.asarray(admissible.radius) * (1 + SLACK)
@@ -205,7 +274,7 @@ def extremes(admissible: AdmissibleSet) -> Array:
     if isinstance(admissible, Finite):
         return admissible.points
     if isinstance(admissible, Box):
-        return admissible.grid(2).points
+        return _spread(admissible, 2) if admissible.unbounded else admissible.grid(2).points
     # the 2^m corners of the cube around the ball, because no polytope inside the ball contains it
     return admissible.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=admissible.dim)))
 
@@ -227,4 +296,6 @@ def spacing(admissible: AdmissibleSet, budget: int) -> list[Number]:
         return [admissible.radius / 2] * admissible.dim  # from the centre to the half-way sphere, and on to the rim
     assert isinstance(admissible, Box)
     per_input = _values_an_input(admissible, budget)
+    if admissible.unbounded:
+        return list(np.ptp(np.asarray(_spread(admissible, per_input)), axis=0) / (per_input - 1))
     return [(admissible.hi[j] - admissible.lo[j]) / (per_input - 1) for j in range(admissible.dim)]

@@ -61,7 +61,7 @@ class _Answer(Protocol):
 
 
 def show(solution: _Answer) -> str:
-    """The printed summary of a solution: at most 15 lines; unknown entries are left out."""
+    """The printed summary of a solution: at most 16 lines; unknown entries are left out."""
     stats, grid = solution.stats, solution.grid
     axes = " x ".join(map(functools.partial(_axis_text, grid), range(grid.ndim)))
     last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
@@ -79,6 +79,7 @@ def show(solution: _Answer) -> str:
         "box error": _estimate(solution.box_error) or number(stats.get("box_error", "")),
         "reached": f"{percent(reached)} of the nodes" if reached < 1 else "",
         "cut": _cuts(solution),
+        "bounds": number(stats.get("bounds", "")),
         "isaacs gap": "" if solution.isaacs_gap is None else number(solution.isaacs_gap),
         "seconds": f"{number(stats['seconds'])}{compiling}" if "seconds" in stats else "",
         "memory": size(stats["bytes"]) if "bytes" in stats else "",

@@ -28,6 +28,7 @@ from jax.sharding import Mesh
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.posing import without_horizon
 from hjbjax.discretisation.schemes import Upwind, check_slopes
+from hjbjax.hamiltonian import exact
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.problem import arguments
@@ -285,6 +286,7 @@ def _solve_together(
     for name, on in lanes.items():
         try:
             with _naming(name):
+                exact.check_unbounded(on, relaxes=method.inner.relaxes)
                 node_checks.check_values(on, clock)
                 admissibility.check_constrained_ends(on.problem, on.grid, on.dtype)
                 if choices.scheme:

@@ -18,6 +18,7 @@ from hjbjax.discretisation import schemes
 from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.posing import with_horizon
 from hjbjax.discretisation.schemes import Limited, Upwind
+from hjbjax.hamiltonian import exact
 from hjbjax.iteration import bellman, time_stepping
 from hjbjax.iteration.evaluation import check_choice
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
@@ -27,7 +28,7 @@ from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.layouts import spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
-from hjbjax.problem.sets import Box
+from hjbjax.problem.sets import Box, refuse_unbounded
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
 from hjbjax.solution import checkpoints
@@ -258,6 +259,7 @@ def _on_host(asked: _Asked, clock: Clock) -> tuple[March, Solution]:
 def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:
     """Check the values of the problem's functions at all nodes, then leave the clock at the preparation."""
     problem = on.problem
+    exact.check_unbounded(on)
     node_checks.check_values(on.asking(_without_moving_target(problem)), clock)
     # a drift that depends on time may respect a constrained end at one time and not at another
     for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
@@ -281,6 +283,9 @@ def _check(problem: object, grid: object, scheme: Scheme, method: TimeMethod, st
     check_choice(method, TimeMethod, "march: method", "hjb.Explicit(...) or hjb.Implicit(...)")
     if method.monotone_only and not scheme.monotone:
         raise ValueError(f"march: Implicit(...) solves with the matrix of a chain; got {scheme!r}, wanted Upwind(...)")
+    if method.limited:
+        for admissible in (problem.controls, problem.disturbances):
+            refuse_unbounded(admissible, "march", "explicit steps are limited by the largest rate, Implicit() is not")
     if step is not None:
         arguments.positive(step, "march: step", "in units of time")
     if time_limit is not None:

@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.hamiltonian import exact
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import Clock, Stopped
@@ -103,6 +104,7 @@ def settled_on_host(
     start: Nodes | None = None if guess is None else np.asarray(guess, on.dtype)
     try:
         # from cheap to expensive: all nodes, the ends of the box, then everything that is compiled for the grid
+        exact.check_unbounded(on, relaxes=method.inner.relaxes)
         node_checks.check_values(on, clock)
         admissibility.check_constrained_ends(problem, grid, on.dtype)
         sharpen = choices.scheme

@@ -19,7 +19,7 @@ from hjbjax.solution.solution import Solution, attach_solution, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
 from hjbjax.solvers.host_loop import WideJit
-from hjbjax.solvers.result import isaacs_gap, warn_of_gap
+from hjbjax.solvers.result import active_bounds, isaacs_gap, warn_of_gap
 from hjbjax.well_posedness import node_checks
 
 CERTIFICATE = "a march has no certificate; halve the spacings and the step to see its error"
@@ -336,6 +336,9 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(slices.value.dtype),
             "certificate": CERTIFICATE,
+            **active_bounds(
+                task.on, None if task.bare else slices.policy[kept][0], f" at t = {slices.times[kept][0]:g}"
+            ),
             "versions": {"jax": jax.__version__, "numpy": np.__version__},
         },
     )

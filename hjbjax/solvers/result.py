@@ -18,6 +18,7 @@ from hjbjax.iteration.isaacs import isaacs_gap
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST, Labels
 from hjbjax.problem.pytree import is_traced
+from hjbjax.problem.sets import Box, at_bounds
 from hjbjax.problem.types import Field, Nodes, Scalar
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
@@ -86,9 +87,26 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(state.value.dtype),
             "certificate": assumptions.sentence,
+            **active_bounds(task.on, arrays["policy"]),
             "versions": {"jax": jax.__version__, "numpy": np.__version__},
         },
     )
+
+
+def active_bounds(on: Discretisation, policy: np.ndarray | None, when: str = "") -> dict[str, str]:
+    """The statistic "bounds": the number of nodes at which a bound holds a control that has a cost of higher order.
+
+    A control with an affine cost is at a bound nearly everywhere, so it is left out.
+    """
+    box, found = on.problem.controls, []
+    if policy is None or not isinstance(box, Box):
+        return {}
+    counts = at_bounds(box, policy.reshape(-1, box.dim))
+    names = on.problem.control_names or [f"u{j + 1}" for j in range(box.dim)]
+    for name, pair, curved in zip(names, counts.tolist(), on.players.control.curved, strict=True):
+        ends = [f"{count:,} at the {end} bound" for count, end in zip(pair, ("lower", "upper"), strict=True) if count]
+        found += [f"{name}: {', '.join(ends)}"] if ends and curved else []
+    return {"bounds": f"{'; '.join(found)}, of {on.grid.size:,} nodes{when}"} if found else {}
 
 
 def _certified(settled: Settled) -> float | None:

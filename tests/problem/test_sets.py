@@ -22,7 +22,8 @@ from hjbjax import Ball, Box, Finite
         (0.0, [1.0], "wanted \\(m,\\) twice"),
         ([[0.0]], [[1.0]], "wanted \\(m,\\) twice"),
         ([float("nan")], [1.0], "Box.lo.*wanted finite numbers"),
-        ([0.0], [float("inf")], "Box.hi.*wanted finite numbers"),
+        ([0.0], [float("-inf")], "Box.hi.*wanted finite numbers, or inf where there is no bound"),
+        ([float("inf")], [float("inf")], "Box.lo.*wanted finite numbers, or -inf where there is no bound"),
         ([None], [1.0], "Box.lo.*wanted finite numbers"),
     ],
 )
@@ -39,6 +40,14 @@ def test_box_wants_numbers(lo):
 
 def test_a_box_of_one_point_is_admissible():
     assert Box([1.0], [1.0]).grid(3).points.tolist() == [[1.0]] * 3
+
+
+def test_an_infinite_bound_cannot_be_sampled_on_a_grid():
+    box = Box([0.0, -1.0], [np.inf, 1.0])
+    assert box.unbounded
+    assert not Box([0.0], [1.0]).unbounded
+    with pytest.raises(ValueError, match=r"Box.grid: got infinite bounds, .* give finite bounds"):
+        box.grid(3)
 
 
 def test_a_set_keeps_its_own_numbers():

@@ -21,6 +21,12 @@ def pendulum(nodes: int, actions: int | None = 21, mass: float = 1.0) -> tuple[h
     return problem, grid
 
 
+def saving(nodes: int, actions: int) -> tuple[hjb.Problem, hjb.Grid]:
+    """The zoo's saving with two incomes on ``nodes`` levels of wealth, with ``actions`` levels of consumption."""
+    problem, grid = hjb.zoo.saving(shape=(nodes,))
+    return dataclasses.replace(problem, controls=problem.controls.grid(actions)), grid
+
+
 def undiscounted_pendulum(nodes: int) -> tuple[hjb.Problem, hjb.Grid]:
     """The zoo's pendulum without a discount, brought to rest at the top; nodes x (nodes + 1)."""
     return hjb.zoo.pendulum(shape=(nodes, nodes + 1))

@@ -1,10 +1,13 @@
-"""A certified solve against other solvers on one chain: the pendulum, K torques, discount 0.1.
+"""A certified solve against other solvers on one chain: the pendulum, K torques, discount 0.1; and saving.
 
 The hand-written numba solver (``peers.numba_pendulum``) solves only this problem. QuantEcon and mdpsolver
 (``peers.decision``) get the exported chain; building it does not count. These three run on one thread, and hjbjax on
 all threads of XLA, so each row also has the number of threads, the CPU seconds and their ratio. mdpsolver gets half the
 nodes per axis and one round, because it takes minutes on the whole chain. All stop at the same tolerance. The benchmark
 checks that two values differ by at most twice the tolerance.
+
+The second problem is consumption and saving with two incomes (``zoo.saving``) and 101 levels of consumption, against
+QuantEcon on the exported chain with a state for every node and income.
 
 First calls, which compile, are reported for every solver. Ours is the first call of this process, and two more after
 clearing JAX's caches; numba's is compiling and one solve. The numba solver uses coarser grids at every size, and hjbjax
@@ -108,6 +111,19 @@ def beside_mdpsolver(nodes: int, actions: int, tol: float) -> list[dict[str, Any
     return [_about(grid, actions, tol) | row for row in rows[1:]]
 
 
+def saving(nodes: int, actions: int, tol: float, repeats: int) -> list[dict[str, Any]]:
+    """Rows of hjbjax and of QuantEcon for saving with two incomes on ``nodes`` levels of wealth."""
+    problem, grid = cases.saving(nodes, actions)
+    about = {"problem": "saving", "shape": [2, nodes], "nodes": 2 * nodes, "controls": actions, "tol": tol}
+    if reason := without("quantecon"):
+        return [about | {"code": "QuantEcon", "status": "SKIPPED", "reason": reason}]
+    rewards, *chain = hjb.chain.transition_arrays(problem, grid)
+    made, took = timed(lambda: decision.quantecon((-rewards, *chain), tol))
+    theirs = {name: (lambda solve=solve: -solve()) for name, solve in made.items()}
+    calls = {OURS: lambda: hjb.solve(problem, grid, tol=tol, scheme=hjb.Upwind()).value, **theirs}
+    return [about | row for row in _rows(calls, interleaved(calls, repeats), dict.fromkeys(made, took))]
+
+
 def _about(grid: hjb.Grid, actions: int, tol: float) -> dict[str, Any]:
     return {"shape": list(grid.shape), "nodes": grid.size, "controls": actions, "tol": tol}
 
@@ -176,6 +192,9 @@ def command(quick: bool, nodes: tuple[int, ...], repeats: int | None, controls: 
         rows += checked(found)
         click.echo(table(found, COLUMNS))
         click.echo("\n".join(f"{row['status'].lower()}: {row['reason']}" for row in found if "reason" in row))
+    found = attempt(lambda: saving(50 if quick else 2000, 101, tol, repeats or (1 if quick else 5)), ABOUT)
+    click.echo(table(checked(found), COLUMNS))
     figures = judged(rows)
+    rows += found
     rows += thresholds.announced(figures, "peers")
     publish(out, "peers", rows, panel="problem", line="code", x=("nodes",), y="seconds")

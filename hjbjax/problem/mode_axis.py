@@ -5,6 +5,7 @@ jumps along it, from mode i to mode i + d modulo k at the rate λ_{i, i+d}, for 
 only need jumps over several nodes of one axis.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, as_partial, is_traced
+from hjbjax.problem.pytree import REMEMBERED, altered, as_partial, is_traced
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, Number
 
@@ -107,32 +108,43 @@ def without_modes(grid: Grid) -> Grid:
 
 
 def _in_mode(function: jax.tree_util.Partial, mode: int) -> jax.tree_util.Partial:
-    """A function with its last argument fixed; a closure, which the search for numbers read from outside follows."""
-    below: Callable = function.func
+    """A function with its last argument fixed."""
+    return jax.tree_util.Partial(_fixed(function.func, mode), (function.args, function.keywords))
+
+
+def _over(
+    function: jax.tree_util.Partial, count: int, place: int, then: Callable | None = None
+) -> jax.tree_util.Partial:
+    """A function of (x, ..., mode) as a function of (z, ...); ``place`` is the position of the state."""
+    return jax.tree_util.Partial(_joined(function.func, count, place, then), (function.args, function.keywords))
+
+
+# Both are closures, not objects, because the search for numbers that a function reads from outside follows closures.
+# The same closure for the same function: otherwise every solve would repeat the checks on one state.
+
+
+@functools.lru_cache(maxsize=REMEMBERED)
+def _fixed(below: Callable, mode: int) -> Callable:
+    """A function with its last argument fixed, of its leaves and the other arguments."""
 
     def fixed(leaves: tuple, *arguments: Any) -> Any:
         numbers, options = leaves
         return below(*numbers, *arguments, mode, **options)
 
-    return jax.tree_util.Partial(fixed, (function.args, function.keywords))
+    return fixed
 
 
-def _over(
-    function: jax.tree_util.Partial, count: int, place: int, then: Callable = lambda found, x: found
-) -> jax.tree_util.Partial:
-    """A function of (x, ..., mode) as a function of (z, ...); ``place`` is the position of the state.
-
-    It is a closure, not an object, because the search for numbers that a function reads from outside follows closures.
-    """
-    below: Callable = function.func
+@functools.lru_cache(maxsize=REMEMBERED)
+def _joined(below: Callable, count: int, place: int, then: Callable | None) -> Callable:
+    """A function of (x, ..., mode) as a function of its leaves and (z, ...)."""
 
     def joined(leaves: tuple, *arguments: Any) -> Any:
         (numbers, options), z = leaves, arguments[place]
         before, after = arguments[:place], arguments[place + 1 :]
-        each = [below(*numbers, *before, z[1:], *after, mode, **options) for mode in range(count)]
-        return then(chosen(z[0], each), z[1:])
+        found = chosen(z[0], [below(*numbers, *before, z[1:], *after, mode, **options) for mode in range(count)])
+        return found if then is None else then(found, z[1:])
 
-    return jax.tree_util.Partial(joined, (function.args, function.keywords))
+    return joined
 
 
 def chosen(mode: Number, each: Sequence[Any]) -> Any:
@@ -166,19 +178,24 @@ def _noise(noise: Any, n: int, count: int, place: int) -> Any:
 
 def _table(table: Any, count: int, place: int) -> jax.tree_util.Partial:
     """A table of k x k numbers, or a function that returns it, as a function of z: the entries (i, i + d), d > 0."""
-    below: Callable | None = table.func if callable(table) else None
+    if not callable(table):
+        return jax.tree_util.Partial(_row(None, count, place), table)
+    return jax.tree_util.Partial(_row(table.func, count, place), (table.args, table.keywords))
+
+
+@functools.lru_cache(maxsize=REMEMBERED)
+def _row(below: Callable | None, count: int, place: int) -> Callable:
+    """The entries (i, i + d), d > 0, of a table as a function of the table, or of its leaves, and (z, ...)."""
 
     def row(leaves: Any, *arguments: Any) -> Array:
-        z = arguments[place]
-        if below is None:
-            entries = leaves
-        else:
+        z, entries = arguments[place], leaves
+        if below is not None:
             numbers, options = leaves
             entries = jnp.asarray(below(*numbers, *arguments[:place], z[1:], *arguments[place + 1 :], **options))
         rows = [jnp.stack([entries[i, (i + d) % count] for d in range(1, count)]) for i in range(count)]
         return chosen(z[0], rows)
 
-    return jax.tree_util.Partial(row, table if below is None else (table.args, table.keywords))
+    return row
 
 
 def of_mode(function: Any, modes: Modes) -> Any:

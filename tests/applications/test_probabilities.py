@@ -336,6 +336,7 @@ def test_where_a_solution_has_no_action_the_state_stays():
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
+@pytest.mark.optimised
 @given(SEEDS)
 @settings(max_examples=10)
 def test_any_feedback_lies_between_the_least_and_the_greatest(seed):

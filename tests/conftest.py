@@ -29,9 +29,9 @@ def _count_programs(event: str, duration: float, **_: object) -> None:
 
 jax.monitoring.register_event_duration_secs_listener(_count_programs)
 
-# Compiled kernels take memory maps, of which Linux allows a process 65,530; XLA crashes beyond that. Before it does,
-# memory runs out: programs with 20,000 maps take about 8 GB.
-MAPS = 40_000 // max(2, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+# Compiled kernels take memory maps, of which Linux allows a process 65,530; XLA crashes beyond that. The programs with
+# 15,000 maps take some 6 GB of memory, which runs out first.
+MAPS = 30_000 // max(2, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 
 
 # XLA takes half of the time of a run. Without its optimiser it takes half as long, and jaxlib 0.10 takes half of that

@@ -29,23 +29,27 @@ def _count_programs(event: str, duration: float, **_: object) -> None:
 
 jax.monitoring.register_event_duration_secs_listener(_count_programs)
 
-# Compiled kernels take memory maps, of which Linux allows a process 65,530; XLA crashes beyond that. They also take
-# memory, some 6 GB for 20,000 of them.
-MAPS = 60_000 // max(2, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+# Compiled kernels take memory maps, of which Linux allows a process 65,530; XLA crashes beyond that. The programs with
+# 15,000 maps take some 6 GB of memory, which runs out first.
+MAPS = 30_000 // max(2, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 
 
-# Two thirds of a run are spent in XLA. Without its optimiser it takes half of the time, and jaxlib 0.10 takes half of
-# that again with its old emitters of fusions. Jaxlib 0.12 has only new ones, which take 1.4 times as long as the old;
-# of its flags none is faster, and `xla_cpu_opt_preset=FAST_COMPILE` takes 1.6 times as long. The old emitters compute a
-# value again in every block of a fusion: their time doubles with every action of a choice among many at constrained
-# boundaries. Tests of this kind are marked ``emitters``, or compile their programs with ``xla.with_emitters()``.
+# XLA takes half of the time of a run. Without its optimiser it takes half as long, and jaxlib 0.10 takes half of that
+# again with its old emitters of fusions. Jaxlib 0.12 has only new ones, which take 1.4 times as long as the old; its
+# `xla_cpu_opt_preset=FAST_COMPILE` takes 1.6 times as long. The old emitters compute a value again in every block of a
+# fusion: their time doubles with every action of a choice among many at constrained boundaries. Tests of this kind are
+# marked ``emitters``, or compile their programs with ``xla.with_emitters()``. One LLVM module per program instead of up
+# to 32 takes 20 % less time and half of the memory maps.
 # Without the optimiser a long computation takes up to seventy times as long: these tests are marked ``optimised``.
-# `XLA_FLAGS= pytest` runs all tests with what users run.
+# `XLA_FLAGS= pytest` runs all tests with the flags that users run.
+# The source lines that JAX notes with every operation take another 3 % of a run, and no test reads them.
 HASTE = "jax_disable_most_optimizations"
-if "XLA_FLAGS" not in os.environ:  # processes that tests start inherit both variables
-    os.environ["XLA_FLAGS"] = xla.OLD_EMITTERS if xla.knows(xla.EMITTERS) else ""
-    os.environ[HASTE.upper()] = "1"
+LINES = "jax_traceback_in_locations_limit"
+if "XLA_FLAGS" not in os.environ:  # processes that tests start inherit the variables
+    os.environ["XLA_FLAGS"] = xla.quick_to_compile()
+    os.environ |= {HASTE.upper(): "1", LINES.upper(): "0"}
     jax.config.update(HASTE, True)
+    jax.config.update(LINES, 0)
 
 
 class Figures:
@@ -65,7 +69,7 @@ def pytest_configure(config):
 
 def pytest_runtest_setup(item):
     """Skip programs that the old emitters take minutes to compile."""
-    if item.get_closest_marker("emitters") and os.environ["XLA_FLAGS"] == xla.OLD_EMITTERS:
+    if item.get_closest_marker("emitters") and xla.OLD_EMITTERS in os.environ["XLA_FLAGS"]:
         pytest.skip("takes the old emitters too long: XLA_FLAGS= pytest -m emitters")
 
 

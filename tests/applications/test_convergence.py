@@ -68,6 +68,7 @@ def test_what_a_study_says_of_its_solutions(plain):
     assert plain.extrapolated is None
 
 
+@pytest.mark.slow
 def test_an_error_below_the_tolerance_is_not_fitted():
     problem, _ = zoo.stochastic_lq()  # the chain is exact on it
     study = hjb.convergence_study(problem, line(21, 41), zoo.stochastic_lq_exact(), tol=1e-6)

@@ -198,6 +198,7 @@ def test_uncontrolled_chains_are_absorbed_as_linear_algebra_says(seed):
 # --- up to a horizon ---
 
 
+@pytest.mark.slow
 def test_the_reflection_principle():
     """P(min ≤ 0 within T) = 2Φ(−x/√T) from x: second order, at all kept times."""
     problem, errors = hjb.Problem(still, noise=1.0), []
@@ -219,6 +220,7 @@ def test_a_target_that_runs_along_with_the_drift():
     assert np.max(np.abs(found.value[0] - exact)) < 0.015
 
 
+@pytest.mark.slow
 def test_staying_is_not_leaving():
     """P(|w| < 1 up to T) = Σ 4/((2k+1)π) (−1)^k exp(−(2k+1)²π²σ²T/8) cos((2k+1)πx/2)."""
     k = 2 * np.arange(20)[:, None] + 1
@@ -334,6 +336,7 @@ def test_where_a_solution_has_no_action_the_state_stays():
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
+@pytest.mark.optimised
 @given(SEEDS)
 @settings(max_examples=10)
 def test_any_feedback_lies_between_the_least_and_the_greatest(seed):

@@ -73,6 +73,7 @@ def test_an_opponent_slows_the_tube_down(player):
     assert np.abs(x[value <= 0]).max() == pytest.approx(edge, abs=0.051)
 
 
+@pytest.mark.slow
 def test_avoid_is_the_mirror_image_of_reach():
     """Who pursues with u in one problem pursues with d in the other."""
     grid = hjb.Grid([-4.0], [4.0], (81,))
@@ -87,6 +88,7 @@ def test_avoid_is_the_mirror_image_of_reach():
     np.testing.assert_allclose(kept_away, -caught, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_set_is_not_a_tube():
     """ẋ = 1: at the end in |x| ≤ ½ only from [−1.5, −.5], at some time from [−1.5, .5]."""
     grid = hjb.Grid([-4.0], [4.0], (161,))

@@ -86,6 +86,7 @@ def test_second_derivatives_of_a_path_are_refused():
         jax.eval_shape(jax.hessian(cost), jnp.asarray(AT))
 
 
+@pytest.mark.slow
 def test_a_known_problem_and_a_traced_one_give_one_path():
     with jax.enable_x64(True):
         assert float(jax.jit(cost)(jnp.asarray(AT))) == pytest.approx(float(cost(AT)), rel=1e-9)

@@ -424,6 +424,7 @@ def swing_up():
 
 @pytest.mark.filterwarnings("ignore:the grid is coarse")
 @pytest.mark.slow
+@pytest.mark.optimised
 @pytest.mark.parametrize("kind", ["extended Kalman", "grid"])
 def test_a_pendulum_swings_up_on_its_angle_alone(swing_up, kind):
     """From 170°, with less torque than gravity and an observer that takes it for hanging at rest."""

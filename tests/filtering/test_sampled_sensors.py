@@ -137,6 +137,7 @@ def test_equal_exact_sensors_of_a_constant_stay_finite():
     assert float(state.covariance[1, 1]) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*narrower than a cell", "ignore:.*is longer than")
 def test_equal_exact_sensors_leave_a_law_on_a_grid():
     law = F.zakai(PLANT, twice, GRID, np.full((3, 2), 5e-3), 0.01, lambda x: jnp.exp(-x @ x), measurement_noise=1e-9)

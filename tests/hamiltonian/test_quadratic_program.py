@@ -213,8 +213,9 @@ def three_inputs(numbers):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the box decides V")
-@pytest.mark.parametrize("scheme", [hjb.Upwind(), pytest.param(hjb.Limited(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Limited()])
 def test_three_inputs_on_two_components(scheme):
     """V exceeded that of 21 values per input by 0.0044 with ``Upwind`` and by 0.042 with ``Limited``."""
     problem = three_inputs({"b": np.array([0.3, -0.05]), "G": B})

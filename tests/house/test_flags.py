@@ -5,10 +5,13 @@ import pytest
 import xla
 
 
-@pytest.mark.parametrize("flag", [xla.EMITTERS, "xla_cpu_enable_fast_math", "xla_cpu_has_no_such_flag"])
-def test_a_flag_is_known_where_xla_takes_it(flag):
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [(xla.EMITTERS, False), (xla.PARTS, 1), ("xla_cpu_enable_fast_math", False), ("xla_cpu_has_no_such_flag", False)],
+)
+def test_a_flag_is_known_where_xla_takes_it(flag, value):
     try:
-        jax.jit(lambda: 0, compiler_options={flag: False})()
+        jax.jit(lambda: 0, compiler_options={flag: value})()
     except jax.errors.JaxRuntimeError:
         assert not xla.knows(flag)
     else:

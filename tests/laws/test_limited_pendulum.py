@@ -15,7 +15,7 @@ from hjbjax import zoo
 
 G = 9.81
 HORIZON = 5.0  # the closed loop decays by e^{−2.7 t}, e^{−1.3 t} as printed: what is left is closed by Riccati
-COASTS = (0.0, 1.0, 1.4, 1.8, 2.2, 2.6)  # seconds without torque before the feedback of a first guess sets in
+COASTS = (0.0, 0.7, 1.0, 1.4, 1.8, 2.2, 2.6)  # seconds without torque before the feedback of a first guess sets in
 
 
 def wrapped(angle):
@@ -77,7 +77,7 @@ class Hamiltonian:
 
             for times, guess in self.first_guesses(start):
                 with np.errstate(all="ignore"):  # nodes crowd at θ = ±π, where the cost has a kink
-                    result = solve_bvp(self.flow, ends, times, guess, tol=1e-4, max_nodes=3000)
+                    result = solve_bvp(self.flow, ends, times, guess, tol=1e-4, max_nodes=1200)
                 last, left = result.y[:, -1], np.sum(result.rms_residuals * np.diff(result.x))
                 if left < 1e-3 and np.max(np.abs(last[:2])) < 0.02:  # the equation holds, and the ball is reached
                     found.append((last[4] + 0.5 * last[:2] @ matrix @ last[:2], np.max(np.abs(result.y[1]))))

@@ -97,6 +97,7 @@ def test_noisy_states_keep_their_chain():
     assert GridFilter(DRIVEN, place, Grid([-2.0] * 2, [2.0] * 2, (9, 9)), prior).axes == (0,)
 
 
+@pytest.mark.slow
 def test_transport_under_jit_vmap_and_grad():
     """The derivative of the mean in the speed, and a batch of speeds, of a traced plant."""
     grid, record = Grid([-2.0], [2.0], (41,)), np.zeros((2, 1))

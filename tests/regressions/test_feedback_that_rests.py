@@ -20,8 +20,9 @@ def mountain_car(cost, **changes):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the box decides", "ignore:the grid is coarse")
-@pytest.mark.parametrize("together", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("together", [False, True])
 def test_a_feedback_that_rests_is_told(together, monkeypatch):
     monkeypatch.setattr("hjbjax.solvers.batch._fills_with_lanes", lambda: True)
     problem = mountain_car(lambda x, u: 0.1 * u @ u)

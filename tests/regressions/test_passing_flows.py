@@ -72,6 +72,7 @@ def test_the_default_reaches_the_target(dtype):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_any_resolution_gives_the_same_share():
     for count in (41, 80, 121):
         with pytest.warns(hjb.SolveWarning, match=UNREACHED):
@@ -172,6 +173,7 @@ def test_what_the_chain_can_do_stays_with_the_chain():
     assert "SemiLagrangian" not in solution.message + solution.stats["scheme"]
 
 
+@pytest.mark.slow
 def test_the_message_tells_never_from_perhaps():
     question = hjb.Problem(FLOW.drift, lambda x, u: 1.0, target=disc)
     with pytest.warns(hjb.SolveWarning, match="carried past the target under every control, so its expected cost is"):

@@ -167,6 +167,7 @@ def test_nothing_paid_on_the_way_and_a_price_at_the_end():
     assert np.allclose(solution.value[1:], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_solve_that_failed_is_no_number_and_neither_is_its_derivative():
     def value(reward, **options):
         problem = hjb.Problem(straight, square, U, target=ends, exit_cost=-reward)

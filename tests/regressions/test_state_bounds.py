@@ -24,6 +24,7 @@ def bounded(line):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 def test_random_problems_agree_with_dense_linear_algebra_and_bounds_hold():
     for seed in range(30):
@@ -138,6 +139,7 @@ def test_bounds_without_a_control_and_other_results_are_refused(controls, said):
         hjb.solve(hjb.Problem(steer, paid, controls, discount=0.5), GRID)
 
 
+@pytest.mark.slow
 def test_a_path_that_may_be_stopped_ends_where_v_says():
     """Bounds that happen to be the same at all states; ``simulate`` refused them where stopping has a cost."""
 

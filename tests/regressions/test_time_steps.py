@@ -110,6 +110,7 @@ def there(speed, step, **options):
     return hjb.march(problem, LINE, 1.0, step=step, **options).value_at(0.0, [0.5])
 
 
+@pytest.mark.slow
 def test_a_step_above_the_limit_is_nan_in_transformations():
     """The host refuses it; V was 1.5e31 and said to be converged."""
     assert np.isnan(jax.jit(lambda a: there(a, 0.03))(1.0))

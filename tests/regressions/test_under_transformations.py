@@ -15,7 +15,7 @@ from hjbjax.solvers import transformed
 from hjbjax.solvers.stationary_run import StationaryRun
 
 # name, nodes of each axis, or None for those of the problem
-QUICK = [("pendulum", (30, 31)), ("bang-bang", (41,))]
+QUICK = [("bang-bang", (41,))]
 SIZES = {1: [(41,), (61,)], 2: [(31, 31), (45, 45)], 3: [(11, 12, 13), (15, 14, 12)]}
 ON_A_RING = {"pendulum": [(30, 31), (44, 45)], "manipulator": [(30, 31), (44, 45)]}  # with a node at rest
 TABLE = [

@@ -38,6 +38,7 @@ def test_noise_that_reflects(sigma, discount, top):
     assert "lower end" not in said[0]
 
 
+@pytest.mark.slow
 def test_drift_that_is_cut():
     """A firm sells the capital that it does not have: V(0) = −10, where −10/9 is right."""
     firm = hjb.Problem(
@@ -105,6 +106,7 @@ def test_units(time):
     np.testing.assert_allclose(scaled.box_error, cost * time * plain.box_error, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_ends_that_cannot_matter():
     """None, and the reason: periodic, constrained without noise, never reached, held by a target."""
     ring = hjb.Problem(lambda x, u: u, lambda x, u: 1 - jnp.cos(x[0]), hjb.Box([-1.0], [1.0]), discount=1.0)

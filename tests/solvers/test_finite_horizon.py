@@ -297,6 +297,7 @@ def pursued(time, x):
     return jnp.abs(x[0] - 0.5 * time) - 0.25
 
 
+@pytest.mark.slow
 def test_a_moving_target_by_hand():
     """|ẋ| ≤ 1, target |x − t/2| ≤ ¼, cost 1: from above (x − ¼)/1.5, from below (−¼ − x)/½, at most T."""
     problem = hjb.Problem(

@@ -1,6 +1,6 @@
 """One problem over many devices: the answer of one, to the last bits where the sweeps are the same.
 
-Eight virtual devices want a process of their own: one runs all cases of this file that are asked for.
+Eight virtual devices require a separate process. It runs all requested cases of one group.
 """
 
 import json
@@ -27,14 +27,20 @@ DEAR = (
     "implicit_march", "open_ends", "without_a_choice", "three_integrators",
 )  # fmt: skip
 EXACT = ("value_iteration", "march_of_first_order", *(name for name in DEAR if name.startswith(("value", "march"))))
+TO_A_TOLERANCE = (
+    *(name for name in DEAR if name.startswith(("sweeps", "krylov"))), "implicit_march", "open_ends", "without_a_choice"
+)  # fmt: skip
 CERTIFIED = ("sweeps", *(name for name in DEAR if name.startswith(("sweeps", "krylov"))))
 ULP = 8  # roundings of the largest value: XLA fuses the same operations otherwise in a smaller array
 
 
-def found_by(names):
-    """What these cases found, by their names."""
-    # the new emitters of fusions, which round alike in arrays of any shape
-    flags = os.environ["XLA_FLAGS"].replace(xla.OLD_EMITTERS, "")
+def found_by(names, emitters=True):
+    """What these cases found, by their names.
+
+    The new emitters of fusions round alike in arrays of any shape. The old ones compile faster.
+    """
+    flags = os.environ["XLA_FLAGS"]
+    flags = flags.replace(xla.OLD_EMITTERS, "") if emitters else flags
     path = f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_NUM_CPU_DEVICES": "8", "PYTHONPATH": path}
     command = [sys.executable, str(SCRIPT), *names]
@@ -50,7 +56,12 @@ def cheap():
 
 @pytest.fixture(scope="module")
 def dear():
-    return found_by(DEAR)
+    return found_by([name for name in DEAR if name not in TO_A_TOLERANCE])
+
+
+@pytest.fixture(scope="module")
+def to_a_tolerance():
+    return found_by(TO_A_TOLERANCE, emitters=False)
 
 
 @pytest.fixture
@@ -58,7 +69,8 @@ def found(request):
     """What the case of a test found."""
     name = request.node.callspec.params.get("name") if hasattr(request.node, "callspec") else None
     name = name or request.node.originalname.removeprefix("test_")
-    answer = request.getfixturevalue("cheap" if name in CHEAP else "dear")[name]
+    group = "cheap" if name in CHEAP else "to_a_tolerance" if name in TO_A_TOLERANCE else "dear"
+    answer = request.getfixturevalue(group)[name]
     assert "failed" not in answer, answer["failed"]
     return answer
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ParamSpec
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from hjbjax.plotting.slices import Cuts
 from hjbjax.plotting.style import COLOURS, Picture, axes_of, legend
@@ -12,7 +12,7 @@ from hjbjax.plotting.style import COLOURS, Picture, axes_of, legend
 if TYPE_CHECKING:
     from hjbjax.solution.solution import Solution
 
-P = ParamSpec("P")
+T = TypeVar("T", bound="Callable[..., Picture]")
 MODE = "mode"  # the name of the axis of modes
 
 
@@ -35,7 +35,7 @@ def of_one_mode(solution: Solution, fixed: Cuts | None) -> tuple[Solution, Cuts 
     return solution.in_mode(mode), cuts
 
 
-def by_mode(draw: Callable[P, Picture]) -> Callable[P, Picture]:
+def by_mode(draw: T) -> T:
     """Decorator of a picture of a solution: over one state it has one line per mode, over two states one mode."""
 
     @functools.wraps(draw)
@@ -43,13 +43,13 @@ def by_mode(draw: Callable[P, Picture]) -> Callable[P, Picture]:
         fixed: Any = options.get("fixed")
         modes, cuts = solution.grid.modes, dict(fixed or {})
         if not modes:
-            return draw(solution, *arguments, **options)  # type: ignore[arg-type]
+            return draw(solution, *arguments, **options)
         if MODE in cuts or solution.grid.ndim - 1 - len(cuts) != 1:
             one, rest = of_one_mode(solution, fixed)
-            return draw(one, *arguments, **(options | {"fixed": rest}))  # type: ignore[arg-type]
+            return draw(one, *arguments, **(options | {"fixed": rest}))
         ax, artists = axes_of(options.get("ax")), []
         for number, name in enumerate(modes):
-            picture: Any = draw(solution.in_mode(number), *arguments, **(options | {"ax": ax}))  # type: ignore[arg-type]
+            picture: Any = draw(solution.in_mode(number), *arguments, **(options | {"ax": ax}))
             line = picture[0]
             line.set_color(COLOURS[number % len(COLOURS)])
             line.set_label(name)
@@ -58,4 +58,4 @@ def by_mode(draw: Callable[P, Picture]) -> Callable[P, Picture]:
         ax.autoscale(axis="y")
         return Picture([*artists, legend(ax)], ax)
 
-    return drawn
+    return cast(T, drawn)

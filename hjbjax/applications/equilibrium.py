@@ -251,7 +251,7 @@ def _on_host(economy: _Economy, lo: float, hi: float, tol: float) -> Equilibrium
     search, width = root_search.start(lo, at_lo, hi, at_hi), tol * (hi - lo)
     while not root_search.is_done(search, width) and len(found) < MOST:
         price = float(root_search.proposal(search))
-        search = root_search.advanced(search, price, evaluate(price), width)
+        search = root_search.narrowed(search, price, evaluate(price), width)
     tried = np.array([[each.price, each.excess] for each in found])
     best = int(np.argmin(np.abs(tried[:, 1])))
     for warning in warnings[best]:  # other prices are not part of the result
@@ -312,7 +312,7 @@ def _search(of_price: Callable, ends: Any, tol: Any, nothing: Any) -> tuple[Any,
         excess, found = of_price(price, value)
         begun = root_search.start(lo, search.f_far, hi, excess)
         first = search._replace(f_far=excess)
-        later = root_search.advanced(search, price, excess, width)
+        later = root_search.narrowed(search, price, excess, width)
         search = jax.tree.map(
             lambda *each: jnp.select([count == 0, count == 1], each[:2], each[2]), first, begun, later
         )

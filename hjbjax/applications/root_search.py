@@ -59,7 +59,7 @@ def is_done(search: Search, tol: Any) -> Any:
     return (best(search)[1] == 0) | ~(xp.abs(search.far - search.near) > 2 * tol) | ~xp.isfinite(search.f_near)
 
 
-def advanced(search: Search, x: Any, f: Any, tol: Any) -> Search:
+def narrowed(search: Search, x: Any, f: Any, tol: Any) -> Search:
     """The search after f was evaluated at x."""
     xp = _arrays((search, x, f))
     same = xp.sign(f) == xp.sign(search.f_near)

@@ -27,7 +27,7 @@ from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
-from hjbjax.problem.mode_axis import of_mode
+from hjbjax.problem.mode_axis import of_mode, without_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced
 from hjbjax.problem.rewards import costs_of
@@ -147,13 +147,7 @@ def simulate(
     loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
     hold = None if hold is False else hold
     times = _times(duration, steps, hold)
-    stepping = Stepping(
-        rtol=float(arguments.positive(rtol, "simulate: rtol")),
-        atol=float(arguments.positive(atol, "simulate: atol")),
-        max_step=np.inf if max_step is None else float(arguments.positive(max_step, "simulate: max_step")),
-        max_steps=arguments.count(max_steps, "simulate: max_steps"),
-        held=hold is not None,
-    )
+    stepping = _stepping(rtol, atol, max_step, max_steps, held=hold is not None)
     key = noise_key(problem, key)
     # importing diffrax changes JAX's configuration, which is part of the key of every compiled function; do it before
     # the first compilation, otherwise the second call compiles again
@@ -163,12 +157,7 @@ def simulate(
     with noting_interrupts(clock), own_settings(x64=True):
         loop = cast(loop, np.float64)  # a float32 solution also closes the loop in float64, like the integration
         check_shapes(loop, start)
-        if loop.grid is not None and not _margin(loop, start) > 0:
-            lo, hi = np.asarray(loop.grid.lo).tolist(), np.asarray(loop.grid.hi).tolist()
-            raise ValueError(
-                f"simulate: x0 = {start.tolist()} is outside the box from {lo} to {hi}, where the feedback is not "
-                "known; start inside, or pass clamp=True"
-            )
+        _check_start(loop, start)
         count = 0 if modes is None else len(modes.names)
         begun = InitialValueProblem(*with_integral(*with_clock(loop, start, key, count)), times, key)
         path, active = _in_chunks(begun, stepping, clock)
@@ -192,10 +181,36 @@ def simulate(
 _margin = jax.jit(Loop.margin)
 
 
+def _stepping(rtol: Number, atol: Number, max_step: Number | None, max_steps: int, *, held: bool) -> Stepping:
+    """The tolerances and limits of the steps, after checks."""
+    return Stepping(
+        rtol=float(arguments.positive(rtol, "simulate: rtol")),
+        atol=float(arguments.positive(atol, "simulate: atol")),
+        max_step=np.inf if max_step is None else float(arguments.positive(max_step, "simulate: max_step")),
+        max_steps=arguments.count(max_steps, "simulate: max_steps"),
+        held=held,
+    )
+
+
+def _check_start(loop: Loop, start: np.ndarray) -> None:
+    """Refuse a start outside the box in which the feedback is known."""
+    if loop.grid is None or _margin(loop, start) > 0:
+        return
+    grid = without_modes(loop.grid)
+    lo, hi = np.asarray(grid.lo).tolist(), np.asarray(grid.hi).tolist()
+    raise ValueError(
+        f"simulate: x0 = {start[-grid.ndim :].tolist()} is outside the box from {lo} to {hi}, where the feedback is "
+        "not known; start inside, or pass clamp=True"
+    )
+
+
 def _is_traced(problem: object, *others: Any) -> bool:
     """True if some number is a tracer, including the numbers that functions close over."""
     names = (*OF_ACTION, *OF_STATE, *RATES)
-    functions = [getattr(problem, name, None) for name in names] + [each for each in others if callable(each)]
+    modes = getattr(problem, "modes", None)
+    tables = [] if modes is None else [modes.rates, modes.switching_cost]
+    functions = [getattr(problem, name, None) for name in names]
+    functions += [each for each in (*tables, *others) if callable(each)]
     return is_traced(problem, *others) or any(map(holds_tracers, functions))
 
 

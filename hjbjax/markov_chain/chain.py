@@ -240,7 +240,7 @@ def evolve(
         )
     if is_traced(problem, grid, policy, disturbance, law):
         return _evolve_traced(problem, grid, scheme, (policy, disturbance), law, plan)
-    law = laws.checked(law, grid)
+    law = laws.check_law(law, grid)
     actions = _with_times((policy, disturbance), plan)
 
     @functools.lru_cache(2)  # each time but the first and the last belongs to two steps
@@ -333,7 +333,9 @@ def _stationary_traced(problem: Problem, grid: Grid, policy: Any, disturbance: A
 
 
 @as_one_program
-def _evolve_traced(problem: Problem, grid: Grid, scheme: Chain, actions: tuple, law: Any, plan: laws.Plan) -> jax.Array:
+def _evolve_traced(
+    problem: Problem, grid: Grid, scheme: Chain, actions: tuple, law: Any, plan: laws.LawSteps
+) -> jax.Array:
     """The laws at the times of a plan inside a JAX transformation; NaN instead of an error."""
     actions = _with_times(actions, plan)
     moments = jnp.asarray(plan.moments)
@@ -347,7 +349,7 @@ def _evolve_traced(problem: Problem, grid: Grid, scheme: Chain, actions: tuple, 
         law, found = carry
         k, weight, duration, slot = entry
         rates = only or _mixed(rates_at(k), rates_at(k + 1), weight)
-        law = laws.advanced(rates, grid, law, duration)
+        law = laws.after_duration(rates, grid, law, duration)
         return (law, found.at[slot].set(law)), None
 
     law = jnp.asarray(law, jnp.result_type(float))
@@ -355,7 +357,7 @@ def _evolve_traced(problem: Problem, grid: Grid, scheme: Chain, actions: tuple, 
     return jax.lax.scan(step, start, jax.tree.map(jnp.asarray, plan.steps))[0][1]
 
 
-_advanced = jax.jit(laws.advanced)
+_advanced = jax.jit(laws.after_duration)
 
 
 def _mixed(first: Rates, second: Rates, weight: Any) -> Rates:
@@ -364,7 +366,7 @@ def _mixed(first: Rates, second: Rates, weight: Any) -> Rates:
     return Rates(first.offsets, tuple((1 - weight) * a + weight * b for a, b in pairs))
 
 
-def _with_times(actions: tuple, plan: laws.Plan) -> tuple:
+def _with_times(actions: tuple, plan: laws.LawSteps) -> tuple:
     """The actions of control and disturbance with an axis of times in front; None if there is no such player."""
     found = []
     for name, action in zip(("policy", "disturbance"), actions, strict=True):

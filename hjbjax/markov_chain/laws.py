@@ -43,7 +43,7 @@ LONGEST = {8: 400.0, 4: 60.0}  # mean jumps per block, by the bytes of a number:
 
 
 @pytree_dataclass(static=("timed",))
-class Plan:
+class LawSteps:
     """The steps of a law forward in time.
 
     Attributes:
@@ -65,7 +65,7 @@ class Plan:
         return len(self.kept)
 
 
-def plan_steps(horizon: Any, times: Any, moments: Any) -> Plan:
+def plan_steps(horizon: Any, times: Any, moments: Any) -> LawSteps:
     """The steps from 0 to the horizon, from each kept time and each moment to the next.
 
     Raises:
@@ -90,7 +90,7 @@ def plan_steps(horizon: Any, times: Any, moments: Any) -> Plan:
     middle = (starts + ends) / 2
     first = np.clip(np.searchsorted(known, middle, side="right") - 1, 0, max(len(known) - 2, 0))
     weight = (middle - known[first]) / (known[first + 1] - known[first]) if len(known) > 1 else np.zeros(len(ends))
-    return Plan(known, moments is not None, kept, (first, weight, ends - starts, np.searchsorted(kept, ends)))
+    return LawSteps(known, moments is not None, kept, (first, weight, ends - starts, np.searchsorted(kept, ends)))
 
 
 def _increasing(given: Any, name: str) -> np.ndarray:
@@ -101,7 +101,7 @@ def _increasing(given: Any, name: str) -> np.ndarray:
     return times
 
 
-def checked(law: Any, grid: Grid) -> np.ndarray:
+def check_law(law: Any, grid: Grid) -> np.ndarray:
     """A law of known numbers, in float64.
 
     Raises:
@@ -125,7 +125,7 @@ def flow(jumps: Rates, grid: Grid, law: Field) -> Field:
     return gained
 
 
-def advanced(jumps: Rates, grid: Grid, law: Field, duration: Number) -> Field:
+def after_duration(jumps: Rates, grid: Grid, law: Field, duration: Number) -> Field:
     """exp(t𝓛*) μ for constant rates: non-negative, with the same sum."""
     dtype = law.dtype
     leaving = jumps.total()

@@ -16,7 +16,7 @@ T = TypeVar("T", bound="Callable[..., Picture]")
 MODE = "mode"  # the name of the axis of modes
 
 
-def of_one_mode(solution: Solution, fixed: Cuts | None) -> tuple[Solution, Cuts | None]:
+def in_fixed_mode(solution: Solution, fixed: Cuts | None) -> tuple[Solution, Cuts | None]:
     """The solution in the mode that ``fixed`` gives by name or number, and the other cuts.
 
     Raises:
@@ -45,7 +45,7 @@ def by_mode(draw: T) -> T:
         if not modes:
             return draw(solution, *arguments, **options)
         if MODE in cuts or solution.grid.ndim - 1 - len(cuts) != 1:
-            one, rest = of_one_mode(solution, fixed)
+            one, rest = in_fixed_mode(solution, fixed)
             return draw(one, *arguments, **(options | {"fixed": rest}))
         ax, artists = axes_of(options.get("ax")), []
         for number, name in enumerate(modes):

@@ -57,7 +57,7 @@ def test_the_search_finds_the_root_that_scipy_finds(f, lo, hi):
     while not root_search.is_done(search, width):
         x = float(root_search.proposal(search))
         assert lo < x < hi
-        search, count = root_search.advanced(search, x, f(x), width), count + 1
+        search, count = root_search.narrowed(search, x, f(x), width), count + 1
     assert float(root_search.best(search)[0]) == pytest.approx(brentq(f, lo, hi, xtol=1e-14), abs=2.1 * width)
     assert count <= 14
 

@@ -117,8 +117,8 @@ MUTANTS = (
     Mutant(
         "½ of the noise",
         "discretisation/discretisation.py",
-        "return {(i, i): s * s for i, s",
-        "return {(i, i): s * s / 2 for i, s",
+        "return {(i, i): spread[i] * spread[i]",
+        "return {(i, i): spread[i] * spread[i] / 2",
         ("tests/markov_chain/test_chain.py", "tests/laws/test_accuracy.py"),
     ),
     Mutant(

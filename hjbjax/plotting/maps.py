@@ -105,8 +105,8 @@ def value(
 
 def _stopped(ax: Axes, solution: Solution, section: Section, time: float | None) -> list[Artist]:
     """Draw the stopping set of the solution, if there is one."""
-    inside = stopping_of(solution, section, time)
-    return [] if inside is None else stopped(ax, section, inside)
+    found = stopping_of(solution, section, time)
+    return [] if found is None else stopped(ax, section, *found)
 
 
 def _without(section: Section, target: Callable[[State], Number] | None) -> tuple[Section, tuple[Region, ...]]:

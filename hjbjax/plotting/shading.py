@@ -180,18 +180,18 @@ def outlined(ax: Axes, region: Region, *, inside: bool = True) -> list[Artist]:
     return artists
 
 
-def stopped(ax: Axes, section: Section, inside: np.ndarray) -> list[Artist]:
+def stopped(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray) -> list[Artist]:
     """Dot the part of a section where it is optimal to stop, up to the free boundary, with an entry in the legend.
 
     Args:
       inside: True for nodes of the stopping set, of the shape of the section.
+      values: V at the same nodes.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
 
     if not inside.any():
         return []
-    values = np.asarray(section.values.data, float)
     style: dict[str, Any] = {"facecolor": "none", "edgecolor": STROKE, "hatch": DOTS}
     artists: list[Artist] = []
     if len(section.axes) == 1:

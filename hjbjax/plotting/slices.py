@@ -119,17 +119,22 @@ def target_of(solution: "Solution", time: float | None = None) -> Callable[[Stat
     return lambda x: problem.target(moment, x)
 
 
-def stopping_of(solution: "Solution", section: Section, time: float | None = None) -> np.ndarray | None:
-    """The stopping set of a solution in the plane of a section, bool; None if there is none, and for tubes.
+def stopping_of(
+    solution: "Solution", section: Section, time: float | None = None
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The stopping set in the plane of a section, bool, and V there; None if there is no set, and for tubes.
 
     A tube without running cost and noise is drawn by its level sets, and its paths do not stop.
     """
     known = described(solution)
     if known.stopping is None or (known.problem is not None and is_tube(known.problem)):
         return None
-    mask = at_time(solution, known.stopping, time)[0].astype(float)
     cuts: Cuts = section.cuts
-    return section_of("value", mask, section.grid, cuts, "", nearest=True).values.data > 0.5
+    inside, value = (
+        section_of("value", at_time(solution, np.asarray(field, float), time)[0], section.grid, cuts, "", nearest=True)
+        for field in (known.stopping, solution.value)
+    )
+    return inside.values.data > 0.5, value.values.data
 
 
 def sets_of(solution: "Solution", time: float | None = None) -> dict[str, Callable[[State], Number]]:

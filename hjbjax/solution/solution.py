@@ -84,8 +84,8 @@ class Solution:
         for a marched solution the largest number in any step down to each kept time, (k, n, 2). Zero at ends that are
         not projected; ``None`` if not counted.
       stopping: the nodes where it is optimal to stop, V = ψ, bool (*grid) or (k, *grid). Ties count, so in a march all
-        nodes with V = ψ at the horizon stop. No node with an infinite ψ stops. ``None`` without a stopping payment, and
-        if only V is stored.
+        nodes with V = ψ at the horizon stop. A node of the target stops only next to a node outside that stops.
+        ``None`` without a stopping payment, and if only V is stored.
       active: the nodes where the running maximum is attained, V = g, like ``stopping``; ``None`` without
         ``running_max``.
       discrete: True if the controls are enumerated, so that the mean of two need not be admissible.

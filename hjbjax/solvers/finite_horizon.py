@@ -455,7 +455,7 @@ def _march_traced(
         fine &= ok & jnp.all(jnp.isfinite(value))
         values.append(value)
         actions.append(time_stepping.greedy_actions(task, value, end))
-        touching.append(contact(problem, task.obstacles_at(end), value))
+        touching.append(contact(problem, grid, task.obstacles_at(end), value))
     u, d = (
         jnp.stack(
             [jnp.stack(each[player], -1) if each[player] else jnp.zeros((*grid.shape, 0), kind) for each in actions]

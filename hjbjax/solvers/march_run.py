@@ -62,7 +62,7 @@ def _greedy(march: March, value: Field, t: Number) -> Feedback:
     def here(march: March, value: Field, t: Number) -> Feedback:
         part = march.on_part(layout)
         obstacles = part.obstacles_at(t)
-        touching = contact(part.problem, obstacles, value)
+        touching = contact(part.problem, part.grid, obstacles, value)
         return time_stepping.greedy_actions(part, value, t), obstacles.ended, obstacles.acting(value), touching
 
     layout = march.division

@@ -288,3 +288,36 @@ def test_a_periodic_axis_has_boundaries_on_both_sides_of_its_seam():
     solution = hjb.solve(wait(lambda x: 1.5 + jnp.cos(x[0] - 0.03)), grid)
     angle = np.arccos(-0.5)
     np.testing.assert_allclose(solution.free_boundary(), np.sort([angle + 0.03, -angle + 0.03]), atol=5e-3)
+
+
+def option(strike):
+    """A put with a horizon in the logarithm of the price."""
+    return hjb.Problem(
+        lambda x, u: 0.02 + 0 * x, noise=0.3, discount=0.06,
+        **dict.fromkeys(("stopping_reward", "terminal_reward"), lambda x: jnp.maximum(strike - jnp.exp(x[0]), 0.0)),
+    )  # fmt: skip
+
+
+LINE, TIMES = hjb.Grid([-1.5], [1.5], (61,)), (0.0, 0.25, 0.5)
+
+
+@pytest.mark.slow
+def test_a_march_inside_a_program_has_the_sets_of_a_march_outside():
+    outside = hjb.march(option(1.0), LINE, 0.5, times=TIMES, step=0.01)
+    inside = jax.jit(jax.vmap(lambda strike: hjb.march(option(strike), LINE, 0.5, times=TIMES, step=0.01)))
+    with jax.enable_x64(True):
+        lanes = inside(np.array([1.0, 1.2]))
+    assert lanes.stopping.shape == (2, 3, 61)
+    np.testing.assert_array_equal(lanes.stopping[0], outside.stopping)
+    assert lanes.stopping[1].sum() > lanes.stopping[0].sum()
+
+
+def test_a_march_that_is_resumed_keeps_its_sets(tmp_path):
+    file = tmp_path / "march.ckpt"
+    first = hjb.march(option(1.0), LINE, 0.5, times=TIMES, checkpoint=file)
+    again = hjb.march(option(1.0), LINE, 0.5, times=TIMES, checkpoint=file, resume=True)
+    np.testing.assert_array_equal(again.stopping, first.stopping)
+    assert first.stopping[:2].any()
+    assert not first.stopping[:2].all()
+    bare = hjb.march(option(1.0), LINE, 0.5, policy=False)
+    assert bare.stopping is None

@@ -79,8 +79,13 @@ def boundary_of(grid: Grid, value: np.ndarray, inside: np.ndarray) -> np.ndarray
     """The boundary of a set of nodes on a grid with one or two axes; see ``points_of`` and ``segments_of``.
 
     Raises:
-      ValueError: more than two axes, or arrays that do not have the shape of the grid.
+      ValueError: modes, more than two axes, or arrays that do not have the shape of the grid.
     """
+    if grid.modes:
+        raise ValueError(
+            f"Solution.free_boundary: got a solution with the modes {', '.join(grid.modes)}; every mode has its own.\n"
+            f"Write solution.in_mode({grid.modes[0]!r}).free_boundary()"
+        )
     if grid.ndim > 2:
         raise ValueError(
             f"Solution.free_boundary: got a grid with {grid.ndim} axes, wanted one or two.\n"

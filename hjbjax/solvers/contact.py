@@ -65,7 +65,7 @@ def _with_neighbours(touches: jax.Array, grid: Grid, obstacles: Obstacles) -> ja
     """The nodes outside of the target, and those of the target that are next to one of them."""
     free = touches & ~obstacles.ended
     beside = jnp.zeros_like(free)
-    for axis in range(grid.ndim):
+    for axis in grid.state_axes:
         for step in (-1, 1):
             beside |= stencil.neighbour(free, grid, stencil.unit(grid, axis, step))
     return free | (touches & beside)

@@ -321,3 +321,28 @@ def test_a_march_that_is_resumed_keeps_its_sets(tmp_path):
     assert not first.stopping[:2].all()
     bare = hjb.march(option(1.0), LINE, 0.5, policy=False)
     assert bare.stopping is None
+
+
+@pytest.mark.parametrize("volatilities", [(0.3, 0.3), (0.2, 0.4)])
+def test_every_mode_has_its_own_boundary(volatilities):
+    """With the same volatility in both modes it is that of one put, else between the boundaries of two puts."""
+    grid, table = Put().grid(101), np.array(volatilities)
+
+    def boundaries(rates):
+        put = hjb.Problem(
+            lambda x, u, mode: 0.05 * x, noise=lambda x, u, mode: jnp.asarray(table)[mode] * x, discount=0.05,
+            stopping_reward=lambda x, mode: jnp.maximum(100.0 - x[0], 0.0), target=lambda x, mode: 399.99 - x[0],
+            exit_reward=0.0, modes=hjb.Modes(("calm", "wild"), rates),
+        )  # fmt: skip
+        solution = hjb.solve(put, grid)
+        assert solution.stopping.shape == (2, 101)
+        with pytest.raises(ValueError, match=r"Write solution.in_mode\('calm'\).free_boundary"):
+            solution.free_boundary()
+        return [float(solution.in_mode(mode).free_boundary()[0]) for mode in ("calm", "wild")]
+
+    calm, wild = boundaries([[0.0, 1.0], [1.0, 0.0]])
+    least, most = sorted(boundaries([[0.0, 0.0], [0.0, 0.0]]))
+    if volatilities[0] == volatilities[1]:
+        np.testing.assert_allclose([calm, wild, most], least, rtol=1e-5)
+    else:
+        assert least < wild < calm < most

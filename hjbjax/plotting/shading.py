@@ -194,11 +194,12 @@ def stopped(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray) 
         return []
     style: dict[str, Any] = {"facecolor": "none", "edgecolor": STROKE, "hatch": DOTS}
     artists: list[Artist] = []
+    named = STOP in ax.get_legend_handles_labels()[1]  # several modes may be drawn on the same axes
     if len(section.axes) == 1:
         (x,) = section.coordinates
         ends = [*x[:1][inside[:1]], *points_of(x, values, inside, None), *x[-1:][inside[-1:]]]
         for k, (left, right) in enumerate(zip(ends[::2], ends[1::2], strict=True)):
-            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k else STOP, **style))
+            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k or named else STOP, **style))
     else:
         area: Any = {"levels": [0.0, 1.0], "colors": "none", "hatches": [DOTS], "zorder": 2}
         dots = ax.contourf(*section.coordinates, inside.T - 0.5, **area)

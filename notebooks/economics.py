@@ -91,7 +91,9 @@ def price(early):
 
 
 line = hjb.Grid([-2.0], [2.0], (201,), names=("log price",))
-american, european = (hjb.march(price(early), line, horizon).value[0] for early in (True, False))
+times = np.linspace(0, horizon, 21)
+marched, held = (hjb.march(price(early), line, horizon, times=times) for early in (True, False))
+american, european = marched.value[0], held.value[0]
 spot = np.exp(line.axis(0))
 d = (np.log(spot) + (rate - sigma**2 / 2) * horizon) / (sigma * np.sqrt(horizon))
 formula = np.exp(-rate * horizon) * norm.cdf(-d) - spot * norm.cdf(-d - sigma * np.sqrt(horizon))
@@ -106,5 +108,23 @@ ax.plot(spot, american, color=plotting.COLOURS[0], label="American")
 ax.plot(spot, european, color=plotting.COLOURS[1], label="European")
 ax.plot(spot, formula, ":", color="black", label="Black and Scholes")
 ax.set(xlim=(0.4, 2.0), ylim=(0, 0.6), xlabel="price", ylabel="value of the put")
+ax.legend(frameon=False)
+plt.show()
+
+# %% [markdown]
+# The put is exercised below a price that rises to 1 at the end: the free boundary, between the nodes. Without an end
+# the boundary is the constant $k/(1+k)$ with $k = 2r/\sigma^2$.
+
+# %%
+lowest = [float(np.exp(marched.free_boundary(time=t)[0])) for t in times[:-1]]
+perpetual = float(hjb.zoo.AmericanPut(1.0, rate, sigma).boundary)
+print(f"exercise below {lowest[0]:.3f} at the beginning, below {lowest[-1]:.3f} near the end")
+assert np.all(np.diff(lowest) > 0)
+assert perpetual < lowest[0] < lowest[-1] < 1
+
+figure, ax = plt.subplots(figsize=(5.4, 3.2), layout="constrained")
+ax.plot(times[:-1], lowest, color=plotting.COLOURS[0], label="exercise below")
+ax.axhline(perpetual, linestyle=":", color="black", label="without an end")
+ax.set(xlim=(0, horizon), ylim=(0.5, 1.0), xlabel="time", ylabel="price")
 ax.legend(frameon=False)
 plt.show()

@@ -405,5 +405,5 @@ def _map_partial(change: Callable[[Solution], Solution]) -> Iterator[None]:
 def _affine(solution: Solution, offset: float, sign: float) -> Solution:
     """Replace V by offset + sign · V; certificates do not hold for a negative cost and are removed."""
     if sign > 0:
-        return dataclasses.replace(solution, value=offset + solution.value)
-    return dataclasses.replace(solution, value=offset - solution.value, enclosure=None)
+        return dataclasses.replace(solution, value=offset + solution.value, stopping=None, active=None)
+    return dataclasses.replace(solution, value=offset - solution.value, enclosure=None, stopping=None, active=None)

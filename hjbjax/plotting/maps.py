@@ -11,7 +11,7 @@ import numpy as np
 from hjbjax.plotting.histories import controls
 from hjbjax.plotting.modes import by_mode
 from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks
-from hjbjax.plotting.shading import Look, draw, fill_missing, frame, is_level, jumps
+from hjbjax.plotting.shading import Look, draw, fill_missing, frame, is_level, jumps, stopped
 from hjbjax.plotting.slices import (
     Cuts,
     Region,
@@ -24,6 +24,7 @@ from hjbjax.plotting.slices import (
     region_of,
     section_of,
     span_of,
+    stopping_of,
     target_of,
     without_jumps,
     zeros,
@@ -54,6 +55,8 @@ def value(
     target: Callable[[State], Number] | None = None,
 ) -> Picture:
     """Plot the value function: a line over one axis, colours with contour lines over two axes.
+
+    The set where it is optimal to stop is dotted, up to the free boundary; see ``Solution.free_boundary``.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
@@ -91,13 +94,19 @@ def value(
     lost = section.values.data[section.values.mask]
     hidden = "V = ∞" if np.all(np.isposinf(lost)) else "V = −∞" if np.all(np.isneginf(lost)) else "V not finite"
     section, regions = _without(section, target_of(solution, time) if target is None else target)
-    artists = draw(ax, section, Look(name, hidden, colorbar), regions)
+    artists = draw(ax, section, Look(name, hidden, colorbar), regions) + _stopped(ax, solution, section, time)
     lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
     if len(lines):
         shades = fill_missing(section.values).T
         style: dict[str, Any] = {"levels": lines, "colors": "white", "linewidths": 0.6, "alpha": 0.65}
         artists.append(ax.contour(*section.coordinates, shades, **style))
     return Picture(artists, ax)
+
+
+def _stopped(ax: Axes, solution: Solution, section: Section, time: float | None) -> list[Artist]:
+    """Draw the stopping set of the solution, if there is one."""
+    found = stopping_of(solution, section, time)
+    return [] if found is None else stopped(ax, section, *found)
 
 
 def _without(section: Section, target: Callable[[State], Number] | None) -> tuple[Section, tuple[Region, ...]]:
@@ -146,7 +155,7 @@ def policy(
         within = at_states(target, section.states(section.coordinates))[inner] <= 0
         hidden = "target" if within[lost].all() else hidden
     look = Look(label, hidden, colorbar, diverging=True, cells=cells, span=span)
-    return Picture(draw(ax, section, look, regions), ax)
+    return Picture(draw(ax, section, look, regions) + _stopped(ax, solution, section, time), ax)
 
 
 @drawing

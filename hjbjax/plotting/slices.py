@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import jax
 import numpy as np
 
+from hjbjax.feedback.payments import is_tube
 from hjbjax.plotting.scales import place_text
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
@@ -60,6 +61,7 @@ class Described(NamedTuple):
     times: Array | None = None
     problem: Any = None  # a Problem, or a stand-in of the user
     discrete: bool = False  # the mean of two enumerated controls may not be admissible
+    stopping: Array | None = None  # the nodes where it is optimal to stop
 
 
 def described(solution: "Solution | None") -> Described:
@@ -115,6 +117,24 @@ def target_of(solution: "Solution", time: float | None = None) -> Callable[[Stat
         return problem.target
     moment = _moment(solution, time)
     return lambda x: problem.target(moment, x)
+
+
+def stopping_of(
+    solution: "Solution", section: Section, time: float | None = None
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The stopping set in the plane of a section, bool, and V there; None if there is no set, and for tubes.
+
+    A tube without running cost and noise is drawn by its level sets, and its paths do not stop.
+    """
+    known = described(solution)
+    if known.stopping is None or (known.problem is not None and is_tube(known.problem)):
+        return None
+    cuts: Cuts = section.cuts
+    inside, value = (
+        section_of("value", at_time(solution, np.asarray(field, float), time)[0], section.grid, cuts, "", nearest=True)
+        for field in (known.stopping, solution.value)
+    )
+    return inside.values.data > 0.5, value.values.data
 
 
 def sets_of(solution: "Solution", time: float | None = None) -> dict[str, Callable[[State], Number]]:

@@ -82,6 +82,8 @@ def plan(header: dict) -> dict[str, Expected]:
         "disturbance": controls,
         "enclosure": Expected(((2, 2),)),
         "reached": Expected((shape, lead + shape), (np.bool_,)),
+        "stopping": Expected((lead + shape,), (np.bool_,)),
+        "active": Expected((lead + shape,), (np.bool_,)),
         "grid_error": Expected((shape, lead + shape)),
         "box_error": Expected((shape, lead + shape)),
         "residuals": Expected((many,)),
@@ -124,7 +126,7 @@ def dataset(solution: Any) -> "xarray.Dataset":
     except ImportError:
         raise ImportError("Solution.to_xarray needs xarray: pip install 'hjbjax[io]'") from None
     grid, labels, marched = solution.grid, solution.labels, solution.times is not None
-    own = ["value", "grid_error", "box_error", "reached", "time", "control", "disturbance"]
+    own = ["value", "grid_error", "box_error", "reached", "stopping", "active", "time", "control", "disturbance"]
     names = [f"state {name}" if name in own else name for name in grid.names]
     lead = ("time",) if marched else ()
     found: dict[str, Any] = {"value": ((*lead, *names), solution.value, {"long_name": labels.long_name})}
@@ -132,6 +134,8 @@ def dataset(solution: Any) -> "xarray.Dataset":
         "grid_error": "estimated error of the grid",
         "box_error": "estimated error of the ends of the box",
         "reached": "the target can be reached",
+        "stopping": "it is optimal to stop",
+        "active": "the running maximum is attained",
     }
     for name, about in described.items():
         array = getattr(solution, name)

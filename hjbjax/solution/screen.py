@@ -39,6 +39,8 @@ class _Answer(Protocol):
     @property
     def cut(self) -> Array | None: ...
     @property
+    def stopping(self) -> Array | None: ...
+    @property
     def steps(self) -> int: ...
     @property
     def residual(self) -> float | None: ...
@@ -80,6 +82,7 @@ def show(solution: _Answer) -> str:
         "reached": f"{percent(reached)} of the nodes" if reached < 1 else "",
         "cut": _cuts(solution),
         "bounds": number(stats.get("bounds", "")),
+        "stopping": _stopping(solution),
         "isaacs gap": "" if solution.isaacs_gap is None else number(solution.isaacs_gap),
         "seconds": f"{number(stats['seconds'])}{compiling}" if "seconds" in stats else "",
         "memory": size(stats["bytes"]) if "bytes" in stats else "",
@@ -143,6 +146,14 @@ def _cuts(solution: _Answer) -> str:
     axes = np.flatnonzero(np.any(counts, axis=1))
     ends = ", ".join(f"{solution.grid.names[axis]} ({both(*counts[axis].tolist())})" for axis in axes)
     return f"drift out of the box, nodes at the ends: {ends}"
+
+
+def _stopping(solution: _Answer) -> str:
+    """The share of the nodes where it is optimal to stop, at the earliest kept time."""
+    if solution.stopping is None:
+        return ""
+    first = solution.stopping if solution.times is None else solution.stopping[0]
+    return f"optimal at {percent(float(np.mean(np.asarray(first))))} of the nodes"
 
 
 def _error(solution: _Answer) -> str:

@@ -22,6 +22,7 @@ from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Array, Numbers
 from hjbjax.solution import archive, files, screen
 from hjbjax.solution.files import FileError
+from hjbjax.solution.free_boundary import boundary_of
 from hjbjax.solution.interpolation import (
     Interpolation,
     Samples,
@@ -82,6 +83,11 @@ class Solution:
       cut: number of nodes at the lower and upper end of each axis at which the optimal drift is cut off, shape (n, 2);
         for a marched solution the largest number in any step down to each kept time, (k, n, 2). Zero at ends that are
         not projected; ``None`` if not counted.
+      stopping: the nodes where it is optimal to stop, V = ψ, bool (*grid) or (k, *grid). Ties count, so in a march all
+        nodes with V = ψ at the horizon stop. A node of the target stops only next to a node outside that stops.
+        ``None`` without a stopping payment, and if only V is stored.
+      active: the nodes where the running maximum is attained, V = g, like ``stopping``; ``None`` without
+        ``running_max``.
       discrete: True if the controls are enumerated, so that the mean of two need not be admissible.
       discrete_disturbance: True if the disturbances are enumerated.
       labels: names and units of the controls, the side of the level set, and whether V is a cost or a reward.
@@ -115,6 +121,8 @@ class Solution:
     box_error: Any = None
     monotone_error: Any = None
     cut: Any = None
+    stopping: Any = None
+    active: Any = None
     discrete: bool = False
     discrete_disturbance: bool = False
     labels: Labels = Labels()
@@ -284,6 +292,50 @@ class Solution:
                 UserWarning,
             )
         return found
+
+    def free_boundary(self, inside: Any = None, *, time: float | None = None) -> np.ndarray:
+        """The boundary of the stopping set between the nodes: points over one axis, segments over two.
+
+        If V leaves ψ smoothly (smooth pasting) or at an angle, the error is of second order in the spacing; otherwise
+        it is half a cell.
+
+        Args:
+          inside: another set of nodes, such as ``active`` of the same solution; a mask like ``stopping``.
+          time: for a marched solution, the kept time nearest to which the boundary is computed; ``None`` is the
+            earliest.
+
+        Returns:
+          Shape (k,), increasing, over one axis. Over two axes shape (k, 2, 2): k segments with two ends each. Ends of
+          the box are not part of the boundary.
+
+        Raises:
+          ValueError: there is no stopping set, the grid has more than two axes, or ``time`` for a stationary solution.
+
+        Example:
+          >>> import jax.numpy as jnp, hjbjax as hjb  # stop at a price of x², or wait for a rate of 1
+          >>> wait = hjb.Problem(lambda x, u: 0 * x, lambda x, u: 1.0, discount=1.0, stopping_cost=lambda x: x[0] ** 2)
+          >>> solution = hjb.solve(wait, hjb.Grid([-2.0], [2.0], (82,)))
+          >>> solution.free_boundary().round(3).tolist()
+          [-1.0, 1.0]
+        """
+        inside = self.stopping if inside is None else inside
+        if is_traced(self, inside):
+            raise ValueError("Solution.free_boundary: got a traced solution; call it outside of jit, vmap and grad")
+        if inside is None:
+            raise ValueError(
+                "Solution.free_boundary: this solution has no stopping set; wanted a problem with a stopping_cost or a "
+                "stopping_reward,\nsolved with its policy, or another set such as solution.active"
+            )
+        if time is not None and self.times is None:
+            raise ValueError(
+                f"Solution.free_boundary: got time = {time!r}, but the solution is stationary; leave it out"
+            )
+        value, inside = np.asarray(self.value), np.asarray(inside, bool)
+        if self.times is not None:
+            times = np.asarray(self.times)
+            index = int(np.argmin(times if time is None else np.abs(times - time)))
+            value, inside = value[index], inside[index]
+        return boundary_of(self.grid, value, inside)
 
     def predict(
         self, observation: Numbers | Sequence, state: Any = None, episode_start: Any = None, deterministic: bool = True

@@ -8,6 +8,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +40,7 @@ from hjbjax.solution.rewards import with_rewards
 from hjbjax.solution.solution import Solution, SolveError, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, march_run, memory, time_probes
+from hjbjax.solvers.contact import contact
 from hjbjax.solvers.march_errors import Marched, with_march_errors
 from hjbjax.solvers.result import solution_at_start, with_last_phase
 from hjbjax.solvers.setup import check_on_one_state, march_evaluation
@@ -444,6 +446,7 @@ def _march_traced(
         checks_rates=checks_rates, checks_noise=checks_noise,
     )  # fmt: skip
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
+    touching: list[dict[str, Any]] = []
     fine = _is_stable(on, method, horizon, step)
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
         # rounding must not add a step to an interval of a whole number of steps, nor one for a kept time at the horizon
@@ -452,6 +455,7 @@ def _march_traced(
         fine &= ok & jnp.all(jnp.isfinite(value))
         values.append(value)
         actions.append(time_stepping.greedy_actions(task, value, end))
+        touching.append(contact(problem, grid, task.obstacles_at(end), value))
     u, d = (
         jnp.stack(
             [jnp.stack(each[player], -1) if each[player] else jnp.zeros((*grid.shape, 0), kind) for each in actions]
@@ -462,8 +466,10 @@ def _march_traced(
     if throw:  # a factor instead of `where`, so that derivatives are NaN too
         found = jax.tree.map(lambda array: array * jnp.where(fine, 1, jnp.nan).astype(kind), found)
     code = jnp.where(fine, Status.CONVERGED, Status.STALLED if method.monotone_only else Status.DIVERGED)
+    sets: dict[str, Any] = {name: jnp.stack([masks[name] for masks in touching[::-1]]) for name in touching[0]}
     return Solution(
         grid, found[0], found[1], found[2] if problem.is_game else None, code=code, steps=count, times=kept,
+        **sets,
         **question(problem),
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, attach_solution, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
+from hjbjax.solvers.contact import contact, has_contact
 from hjbjax.solvers.host_loop import WideJit
 from hjbjax.solvers.result import active_bounds, isaacs_gap, warn_of_gap
 from hjbjax.well_posedness import node_checks
@@ -35,8 +36,10 @@ ADVICE = {
 
 _terminal = jax.jit(time_stepping.terminal)
 
-# the players' actions, the nodes on the target, and the nodes at which actions matter
-Feedback: TypeAlias = tuple[tuple[tuple[Field, ...], tuple[Field, ...]], jax.Array | bool, jax.Array]
+# the players' actions, the nodes on the target, the nodes at which actions matter, and the sets of ``contact``
+Feedback: TypeAlias = tuple[
+    tuple[tuple[Field, ...], tuple[Field, ...]], jax.Array | bool, jax.Array, dict[str, jax.Array]
+]
 
 
 # not donated: a chunk that ends in NaN is repeated from the front before it
@@ -54,12 +57,13 @@ def _run(march: March, front: Front, until: Number, most: Number) -> Front:
 
 @jax.jit
 def _greedy(march: March, value: Field, t: Number) -> Feedback:
-    """The players' actions at the time t, the nodes on the target, and the nodes at which actions matter."""
+    """The actions at the time t, the target, the nodes at which actions matter, and the sets of ``contact``."""
 
     def here(march: March, value: Field, t: Number) -> Feedback:
         part = march.on_part(layout)
         obstacles = part.obstacles_at(t)
-        return time_stepping.greedy_actions(part, value, t), obstacles.ended, obstacles.acting(value)
+        touching = contact(part.problem, part.grid, obstacles, value)
+        return time_stepping.greedy_actions(part, value, t), obstacles.ended, obstacles.acting(value), touching
 
     layout = march.division
     return layout.mapped(here, (march.over_nodes(layout.entries), True, False), True)(march, value, t)
@@ -106,6 +110,10 @@ class Slices:
         self.value = np.empty((len(kept), *shape), dtype)
         self.policy, self.disturbance = (np.empty((len(kept), *shape, size), dtype) for size in sizes)
         self.cut, self.ends = (np.zeros((len(kept), len(shape), 2), int) for _ in range(2))
+        sets = {} if task.bare else has_contact(problem)
+        self.touching: dict[str, Any] = {
+            name: np.zeros((len(kept), *shape), bool) for name, there in sets.items() if there
+        }
         self.first = len(kept)  # index of the first filled slice; decreases, as the march goes backward in time
 
     def keep(self, task: March, value: Nodes, moment: float, answer: Any) -> None:
@@ -116,7 +124,9 @@ class Slices:
         if answer is None:
             self.policy[place] = self.disturbance[place] = np.nan
         else:
-            (u, d), ended, acting = answer
+            (u, d), ended, acting, touching = answer
+            for name, mask in touching.items():
+                self.touching[name][place] = mask
             found = edges.cut(task.problem, task.grid, self.value[place], (list(u), list(d)), acting, t)
             self.cut[place], self.ends[place] = found
             for array, action in ((self.policy, u), (self.disturbance, d)):
@@ -125,10 +135,15 @@ class Slices:
         self.times[place] = moment
         self.first = place  # last, so that an interrupt does not leave a partly filled slice
 
+    def _arrays(self) -> list[np.ndarray]:
+        """All arrays, with the kept times as their leading axis."""
+        own = [self.times, self.value, self.policy, self.disturbance, self.cut, self.ends]
+        return own + list(self.touching.values())
+
     def saved(self) -> list[np.ndarray]:
         """The filled slices, and their number."""
         filled = slice(self.first, None)
-        arrays = (self.times, self.value, self.policy, self.disturbance, self.cut, self.ends)
+        arrays = self._arrays()
         # copies: saved data must not change when the march continues
         return [np.array(len(self.times) - self.first), *(array[filled].copy() for array in arrays)]
 
@@ -143,7 +158,7 @@ class Slices:
         if not 0 <= filled <= len(self.times):
             raise ValueError(f"it counts {filled} slices of {len(self.times)}")
         self.first = len(self.times) - int(filled)
-        whole = (self.times, self.value, self.policy, self.disturbance, self.cut, self.ends)
+        whole = self._arrays()
         check_alike(own, [array[self.first :] for array in whole])
         for array, entries in zip(whole, own, strict=True):
             array[self.first :] = entries
@@ -328,6 +343,7 @@ def assemble(task: March, grid: Grid, slices: Slices, front: Front, code: Status
         isaacs_gap=_isaacs_gap(task, front, code),
         times=slices.times[kept],
         cut=None if task.bare else slices.cut[kept],
+        **{name: masks[kept] for name, masks in slices.touching.items()},
         **question(problem),
         message=_message(task, front, code),
         stats={

@@ -26,6 +26,7 @@ from hjbjax.solution.status import Status, warn
 from hjbjax.solvers import grid_error
 from hjbjax.solvers.arrival import warn_of_no_arrival
 from hjbjax.solvers.coarser_answer import CoarserAnswer
+from hjbjax.solvers.contact import contact_of_solve
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
 from hjbjax.well_posedness import earnings, node_checks
@@ -53,6 +54,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     gap = None if mute else _isaacs_gap(task, state)
     unanswered = mute or code in (Status.DIVERGED, Status.NONFINITE)  # there is no optimal drift
     leaving = None if unanswered else _leaving(task, state)
+    touching: dict[str, Any] = {} if unanswered else contact_of_solve(task, state)
     if not mute and code is Status.CONVERGED:
         warn_of_no_arrival(task, state)
     state = jax.device_get(state)
@@ -77,6 +79,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
         isaacs_gap=gap,
         reached=reached,
         cut=leaving,
+        **touching,
         **question(task.problem),
         residuals=residuals,
         message=" ".join(filter(None, [message, note])),

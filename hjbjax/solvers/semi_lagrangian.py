@@ -31,6 +31,7 @@ from hjbjax.solution.clock import CUT, Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, memory
+from hjbjax.solvers.contact import contact
 from hjbjax.solvers.host_loop import FIRST_NODES, WideJit
 from hjbjax.solvers.result import solution_at_start, warn_of_cuts, within_reach
 from hjbjax.solvers.setup import check_on_one_state, is_carried_past, warn_unreached
@@ -288,13 +289,14 @@ def finish_arcs(followed: Followed) -> Solution:
     policy = np.array(np.asarray(plan.actions)[state.number // len(plan.legs)])
     leaving = None if code in CUT or not looked else _leaving(on, value, policy, task)
     policy[~counted | np.asarray(task.obstacles.ended) | (not looked)] = np.nan
+    touching = {} if leaving is None else jax.device_get(contact(problem, on.grid, task.obstacles, value))
     best = float(state.progress.best[0])
     message = within_reach(best) if code is Status.STALLED and np.isfinite(best) else problem.labels.word(code.message)
     solution = solution_at_start(on, value, code)
     solution = dataclasses.replace(
         solution, policy=policy, message=message, reached=reached, cut=leaving, steps=state.progress.steps,
         residuals=residuals, enclosure=certificates.enclosure(task.certificate, state.bound) if looked else None,
-        discrete=isinstance(problem.controls, Finite),
+        discrete=isinstance(problem.controls, Finite), **touching,
     )  # fmt: skip
     solution.stats["certificate"] = WORDS[task.certificate] + "; over the arcs of the scheme"
     return _said(solution, scheme)

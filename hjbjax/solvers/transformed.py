@@ -38,6 +38,7 @@ from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, keeping_warnings
 from hjbjax.solvers import host_loop, memory
+from hjbjax.solvers.contact import has_contact
 from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
 from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain, finish_arcs
@@ -83,6 +84,7 @@ class Found:
       monotone_error: of the monotone solution, infinite without a certificate.
       followed: True for a solution on arcs; None if arcs are not possible.
       arc: the number of the best arc of every node, (*grid); None if arcs are not possible.
+      touching: the sets ``stopping`` and ``active`` of the Solution, as far as the problem has them.
     """
 
     value: Any
@@ -97,13 +99,14 @@ class Found:
     monotone_error: Any
     followed: Any = None
     arc: Any = None
+    touching: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def solve_in_program(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | None, tol: Number) -> Solution:
     """The solution, whose value and policy are functions of the numbers in the problem and in the grid."""
     method = choose(problem, grid, traced=True, method=asked.method).inner
     on = Discretisation(problem, grid, asked.scheme or _scheme(problem, method), asked.dtype)
-    found = _on_host(asked, (problem, grid, asked.method, guess, tol), on)
+    found = _on_host(asked, (problem, grid, asked.method, guess, tol), on, bare=is_bare(method))
     task = _task(on, method, tol, found)
     value, policy = _differentiable(task, on.scheme, found)
     if found.followed is not None:
@@ -123,6 +126,7 @@ def solve_in_program(problem: Problem, grid: Grid, asked: Asked, guess: Nodes | 
         code=found.code, steps=found.steps,
         enclosure=found.enclosure if certified else None,
         monotone_error=None if chain else found.monotone_error,
+        **found.touching,
         **question(problem),
     )  # fmt: skip
 
@@ -178,13 +182,15 @@ def _may_follow(asked: Asked, problem: Problem, grid: Grid) -> bool:
     return asked.method is None and asked.scheme is None and can_replace_chain(problem, grid)
 
 
-def _on_host(asked: Asked, given: Any, on: Discretisation) -> Found:
+def _on_host(asked: Asked, given: Any, on: Discretisation, *, bare: bool) -> Found:
     """The result of the host, lane by lane if some of its arguments are batched."""
     leaves, structure = jax.tree.flatten(given)
-    leaves = [jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf for leaf in leaves]
+    # JAX keeps a float32 copy of a NumPy array that the caller's program uses, and would pass it to the host's float64
+    # programs as well, so these get arrays of their own
+    leaves = [jax.lax.stop_gradient(leaf) if is_traced(leaf) else _own(leaf) for leaf in leaves]
     varying = [i for i, leaf in enumerate(leaves) if is_traced(leaf)]
     ranks = [jnp.ndim(leaves[i]) for i in varying]
-    like = _shapes(on, may_follow=_may_follow(asked, on.problem, on.grid))
+    like = _shapes(on, may_follow=_may_follow(asked, on.problem, on.grid), bare=bare)
     setting = host_loop.setting("jax_default_device")
 
     def all_lanes(*arrays: np.ndarray) -> Found:
@@ -206,8 +212,13 @@ def _on_host(asked: Asked, given: Any, on: Discretisation) -> Found:
     return call_on_host(all_lanes, like, *(leaves[i] for i in varying), vmap_method="expand_dims")
 
 
-def _shapes(on: Discretisation, *, may_follow: bool) -> Found:
-    """The shapes and dtypes of the host's result; ``may_follow``: it may be a solution on arcs."""
+def _own(leaf: Any) -> Any:
+    """A copy of a NumPy array; anything else is unchanged."""
+    return leaf.copy() if isinstance(leaf, np.ndarray) else leaf
+
+
+def _shapes(on: Discretisation, *, may_follow: bool, bare: bool) -> Found:
+    """The shapes and dtypes of the host's result; ``may_follow``: it may be a solution on arcs; ``bare``: only V."""
     shape, inputs = on.grid.shape, (on.problem.controls, on.problem.disturbances)
 
     def array(*axes: int, dtype: Any = on.dtype) -> Any:
@@ -219,6 +230,7 @@ def _shapes(on: Discretisation, *, may_follow: bool) -> Found:
         array(*shape), Greedy(array(*shape), *players), mask, mask, number, count, count,
         array(dtype=np.dtype(bool)), array(2, 2), number,
         array(dtype=np.dtype(bool)) if may_follow else None, array(*shape, dtype=count.dtype) if may_follow else None,
+        {} if bare else {name: mask for name, there in has_contact(on.problem).items() if there},
     )  # fmt: skip
 
 
@@ -259,7 +271,9 @@ def _solved(
         try:
             settled, _ = settled_on_host(on, method, float(tol), guess, clock, choices)
         except Stopped as stop:
-            like = _shapes(dataclasses.replace(on, dtype=asked.inner), may_follow=may_follow)
+            like = _shapes(
+                dataclasses.replace(on, dtype=asked.inner), may_follow=may_follow, bare=is_bare(method.inner)
+            )
             nothing = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
             return altered(nothing, code=np.int32(stop.status), enclosure=np.array(NOTHING))
         if isinstance(settled, Followed):
@@ -282,7 +296,15 @@ def _solved(
         monotone_error=np.asarray(np.inf if error is None else error),
         followed=np.asarray(False) if may_follow else None,
         arc=np.zeros(grid.shape, np.int32) if may_follow else None,
+        touching={} if is_bare(method.inner) else _touching(solution, problem),
     )
+
+
+def _touching(solution: Solution, problem: Problem) -> dict[str, np.ndarray]:
+    """The sets of the solution that the problem has; empty sets if the solve failed."""
+    nowhere = np.zeros(solution.grid.shape, bool)
+    found = {name: getattr(solution, name) for name, there in has_contact(problem).items() if there}
+    return {name: nowhere if mask is None else mask for name, mask in found.items()}
 
 
 def _found_on_arcs(followed: Followed) -> Found:
@@ -304,6 +326,7 @@ def _found_on_arcs(followed: Followed) -> Found:
         monotone_error=np.asarray(np.inf if solution.error is None else solution.error),
         followed=np.asarray(True),
         arc=np.asarray(state.number),
+        touching=_touching(solution, followed.on.problem),
     )
 
 

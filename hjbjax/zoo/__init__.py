@@ -12,8 +12,9 @@ under the names that the command line uses.
 """
 
 from hjbjax.zoo.entry import Entry
-from hjbjax.zoo.finance import Merton, merton, merton_exact
+from hjbjax.zoo.finance import Merton, Wealth, merton, merton_exact, merton_wealth, merton_wealth_exact
 from hjbjax.zoo.geometric import Angle, CarWithTrailers, OneWay, Pomet, Unicycle
+from hjbjax.zoo.growth import Ramsey, growth, growth_exact
 from hjbjax.zoo.landing import Lander, moon_landing, moon_landing_burn, moon_landing_exact
 from hjbjax.zoo.linear_quadratic import (
     LinearScalar,
@@ -53,6 +54,15 @@ from hjbjax.zoo.stochastic import (
     brownian_ball_exact,
     brownian_exit,
     brownian_exit_exact,
+)
+from hjbjax.zoo.stopping import (
+    AmericanPut,
+    Firm,
+    american_put,
+    leland,
+    leland_exact,
+    perpetual_put,
+    perpetual_put_exact,
 )
 from hjbjax.zoo.switching import Saving, Thermostat, saving, thermostat
 
@@ -129,6 +139,48 @@ _ENTRIES = (
         duration=10.0,
     ),
     Entry(
+        "merton-wealth",
+        "consume and invest, in levels of wealth instead of logarithms",
+        merton_wealth,
+        merton_wealth_exact,
+        start=(1.0,),
+        duration=10.0,
+    ),
+    Entry(
+        "growth",
+        "how much of the output to consume and how much to invest",
+        growth,
+        growth_exact,
+        # a third of the steady state with the defaults
+        start=(3.0,),
+        duration=40.0,
+    ),
+    Entry(
+        "perpetual-put",
+        "when to exercise an American put without maturity",
+        perpetual_put,
+        perpetual_put_exact,
+        start=(100.0,),
+        duration=10.0,
+    ),
+    Entry(
+        "american-put",
+        "when to exercise an American put before it matures",
+        american_put,
+        # at the strike, one unit of time before maturity
+        start=(40.0, 1.0),
+        duration=1.0,
+    ),
+    Entry(
+        "leland",
+        "when the owners of a firm default on its debt",
+        leland,
+        leland_exact,
+        # the logarithm of assets worth 100
+        start=(4.6,),
+        duration=10.0,
+    ),
+    Entry(
         "moon-landing",
         "land a rocket with the least fuel: when to start the engine",
         moon_landing,
@@ -145,6 +197,7 @@ _ENTRIES = (
 catalogue: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
 
 __all__ = [
+    "AmericanPut",
     "Angle",
     "BallAndBeam",
     "BangBang",
@@ -153,6 +206,7 @@ __all__ = [
     "DoubleIntegrator",
     "Dubins",
     "Entry",
+    "Firm",
     "FlexibleJoint",
     "Lander",
     "LinearScalar",
@@ -162,12 +216,15 @@ __all__ = [
     "Pendulum",
     "PlanarQuadrotor",
     "Pomet",
+    "Ramsey",
     "Saving",
     "SingleIntegrator",
     "Smooth",
     "Thermostat",
     "Unicycle",
     "VanDerPol",
+    "Wealth",
+    "american_put",
     "bang_bang",
     "bang_bang_exact",
     "brownian_ball",
@@ -182,16 +239,24 @@ __all__ = [
     "dubins",
     "eikonal",
     "eikonal_exact",
+    "growth",
+    "growth_exact",
+    "leland",
+    "leland_exact",
     "lq_game",
     "lq_game_exact",
     "manipulator",
     "merton",
     "merton_exact",
+    "merton_wealth",
+    "merton_wealth_exact",
     "moon_landing",
     "moon_landing_burn",
     "moon_landing_exact",
     "pendulum",
     "pendulum_near_upright",
+    "perpetual_put",
+    "perpetual_put_exact",
     "saving",
     "smooth",
     "smooth_exact",

@@ -169,3 +169,107 @@ def merton_exact(
     system = Merton(interest, growth, volatility, aversion, discount)
     system.check()
     return answer(system.value)
+
+
+@pytree_dataclass()
+class Wealth:
+    """Merton's problem in the level W of wealth instead of its logarithm; the utility is a reward.
+
+        dW = W (r + π(μ − r) − k) dt + W πσ dw,     V = k*^{−γ} W^{1−γ}/(1−γ)
+
+    The controls are again the share π and the consumption rate k, so the optimal ones are constants. Drift and noise
+    are proportional to the wealth.
+
+    Args:
+      system: the numbers of the problem.
+    """
+
+    system: Merton
+
+    def drift(self, x: State, u: Control) -> State:
+        """The mean growth of the wealth."""
+        system = self.system
+        return x * (system.interest + u[0] * (system.growth - system.interest) - u[1])
+
+    def noise(self, x: State, u: Control) -> State:
+        """W πσ."""
+        return x * (u[0] * self.system.volatility)
+
+    def reward(self, x: State, u: Control) -> Number:
+        """The utility of the consumption k·W."""
+        return 0 - self.system.cost(jnp.log(x), u)
+
+    def outside(self, x: State) -> Number:
+        """≤ 0 at the ends of the box, 1/2 and 2."""
+        return (2 - 0.5) / 2 * (1 - 1e-6) - jnp.abs(x[0] - (2 + 0.5) / 2)
+
+    def value(self, x: State) -> Scalar:
+        """The value at one level of wealth."""
+        return 0 - self.system.value(jnp.log(jnp.asarray(x)))
+
+
+@front_door
+def merton_wealth(
+    *,
+    interest: Number = 0.03,
+    growth: Number = 0.07,
+    volatility: Number = 0.2,
+    aversion: Number = 2.0,
+    discount: Number = 0.05,
+    shape: tuple[int, ...] = (151,),
+) -> tuple[Problem, Grid]:
+    """Consume and invest, in levels: wealth in [1/2, 2], share in [0, 1], consumption rate in [0.01, 0.1].
+
+    The exact value is prescribed at both ends, as in ``merton``.
+
+    Args:
+      interest: r, the rate of the safe asset, per unit of time.
+      growth: μ, the mean rate of the risky asset.
+      volatility: σ of the risky asset.
+      aversion: γ, the relative risk aversion; not 1.
+      discount: ρ, the discount rate of later consumption.
+      shape: number of nodes.
+
+    Raises:
+      ValueError: the optimal share or consumption is outside the box, so the value at the ends is unknown.
+    """
+    system = Merton(interest, growth, volatility, aversion, discount)
+    system.check()
+    wealth = Wealth(system)
+    problem = Problem(
+        wealth.drift,
+        reward=wealth.reward,
+        controls=Box(*zip(SHARES, RATES, strict=True)),
+        noise=wealth.noise,
+        discount=discount,
+        target=wealth.outside,
+        exit_reward=wealth.value,
+        control_names=("share at risk", "consumption"),
+    )
+    return problem, Grid([0.5], [2.0], shape, names=("wealth",))
+
+
+@front_door
+def merton_wealth_exact(
+    *,
+    interest: Number = 0.03,
+    growth: Number = 0.07,
+    volatility: Number = 0.2,
+    aversion: Number = 2.0,
+    discount: Number = 0.05,
+) -> Exact:
+    """The value as a function of wealth; −493.8271605 at wealth 1 with the defaults.
+
+    Args:
+      interest: r.
+      growth: μ.
+      volatility: σ.
+      aversion: γ, not 1.
+      discount: ρ.
+
+    Raises:
+      ValueError: the optimal share is outside [0, 1], or the optimal consumption is outside [0.01, 0.1].
+    """
+    system = Merton(interest, growth, volatility, aversion, discount)
+    system.check()
+    return answer(Wealth(system).value)

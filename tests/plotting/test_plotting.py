@@ -666,3 +666,55 @@ def test_pictures_ask_of_a_study_what_it_has():
         assert {*attributes} <= {*kind.__dataclass_fields__, *dir(kind)}
     with pytest.raises(TypeError, match=r"perturbation: got study = 3, wanted the result of perturbation_study"):
         plotting.perturbation(3)
+
+
+@pytest.mark.parametrize("draw", ["value", "policy"])
+def test_the_stopping_set_is_dotted_up_to_the_free_boundary(draw):
+    """V − ψ = (|x| − 1)² outside of the unit ball, ψ = x₁: over one axis bands, over two an area with its outline."""
+
+    def priced(x):
+        return x[..., 0] + np.maximum(np.linalg.norm(x, axis=-1) - 1, 0) ** 2
+
+    def inside(grid):
+        return np.linalg.norm(grid.nodes(), axis=-1) <= 1
+
+    grid = Grid([-2.0], [2.0], (42,))
+    solution = made(grid, priced, stopping=inside(grid))
+    picture = getattr(plotting, draw)(solution)
+    (band,) = [artist for artist in picture if artist.get_label() == "stop"]
+    left, right = band.get_x(), band.get_x() + band.get_width()
+    np.testing.assert_allclose([left, right], solution.free_boundary())
+    np.testing.assert_allclose([left, right], [-1, 1], atol=0.05)
+    assert "stop" in labels(picture.ax)
+    saved(picture)
+    grid = Grid([-2.0, -2.0], [2.0, 2.0], (41, 42))
+    solution = made(grid, priced, stopping=inside(grid))
+    picture = getattr(plotting, draw)(solution)
+    np.testing.assert_array_equal(hatched_nodes(picture, grid), solution.stopping)
+    assert labels(picture.ax) == ["stop"]
+    saved(picture)
+    nowhere = made(grid, priced, stopping=np.zeros(grid.shape, bool))
+    assert labels(getattr(plotting, draw)(nowhere).ax) == []
+
+
+def test_a_cut_and_a_march_show_their_own_stopping_set():
+    grid = Grid([-2.0] * 3, [2.0] * 3, (9, 10, 11))
+    radius = np.linalg.norm(grid.nodes(), axis=-1)
+    solution = made(grid, lambda x: radius, stopping=radius <= 1.2)
+    picture = plotting.value(solution, fixed={2: 0.8})
+    plane = Grid([-2.0] * 2, [2.0] * 2, (9, 10))
+    np.testing.assert_array_equal(hatched_nodes(picture, plane), (radius <= 1.2)[:, :, 7])
+    line = Grid([-2.0], [2.0], (41,))
+    x = line.axis(0)
+    value = np.stack([np.maximum(abs(x) - end, 0) ** 2 for end in (0.5, 1.0)])
+    marched = Solution(line, value, np.zeros((2, 41, 0)), times=np.array([0.0, 1.0]), stopping=value == 0)
+    for time, end in ((0.0, 0.5), (1.0, 1.0)):
+        (band,) = [artist for artist in plotting.value(marched, time=time) if artist.get_label() == "stop"]
+        assert band.get_x() + band.get_width() == pytest.approx(end, abs=0.01)
+
+
+def test_a_tube_has_no_stopping_set_in_its_picture():
+    grid = Grid([-2.0], [2.0], (41,))
+    problem = Problem(lambda x, u: u, controls=Box([-1.0], [1.0]), stopping_cost=lambda x: jnp.abs(x[0]))
+    solution = made(grid, lambda x: x[..., 0] ** 2, stopping=np.ones(41, bool), problem=problem)
+    assert labels(plotting.value(solution).ax) == []

@@ -64,3 +64,12 @@ def test_numbers_of_64_bits_in_a_closure_may_be_traced_in_a_solve_of_32(transfor
             float(transformed(lambda w, d=d: cost_of(w, d))(jnp.asarray(0.9))) for d in ("float32", "float64")
         )
     assert short == pytest.approx(long, rel=1e-4)
+
+
+def test_a_program_of_32_bits_returns_the_grid_that_it_solves_on():
+    """JAX passed its float32 copy of the grid's corners, a part of the solution, to float64 programs of the host."""
+    grid = hjb.Grid([0.0], [1.0], (21,), edges=(("projected", hjb.Dirichlet(3.0)),))
+    problem = hjb.Problem(lambda x, u: 0.05 * x, lambda x, u: 1.0, noise=lambda x, u: 0.3 + x, discount=0.05)
+    wanted = hjb.solve(problem, grid).value
+    solution = jax.jit(lambda problem: hjb.solve(problem, grid))(problem)
+    np.testing.assert_allclose(solution.value, wanted, rtol=1e-6)

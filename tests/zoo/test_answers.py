@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hjbjax import zoo
+from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.sets import Ball, Finite
 
 WITH_ANSWER = [entry for entry in zoo.catalogue.values() if entry.exact is not None]
@@ -18,20 +19,31 @@ def name_of(entry):
 
 
 def equation_residual(problem, value, x, candidates, opponents=None):
-    """β V − min_u max_d [L + f·DV + ½ tr(σσ' D²V)] at one state, over the candidates given."""
+    """β V − min_u max_d [L + f·DV + ½ tr(σσ' D²V)] at one state, over the candidates given; or V − ψ, if it is larger.
+
+    A reward is minus a cost.
+    """
+    if problem.payoff == "reward":
+        problem, reward = costs_of(problem), value
+        value = lambda x: -reward(x)  # noqa: E731
     slope, curvature = jax.grad(value)(x), jax.hessian(value)(x)
 
     def rate(u, d):
         inputs = problem.arguments(x, u, d)
         sigma = problem.diffusion(*inputs)
         diffusive = 0.5 * jnp.sum((sigma @ sigma.T) * curvature) if sigma.shape[1] else 0.0
-        return problem.cost(*inputs) + problem.drift(*inputs) @ slope + diffusive
+        cost = 0.0 if problem.cost is None else problem.cost(*inputs)
+        return cost + problem.drift(*inputs) @ slope + diffusive
 
     if opponents is None:
         best = jnp.min(jax.vmap(lambda u: rate(u, None))(candidates))
     else:
         best = jnp.min(jnp.max(jax.vmap(lambda u: jax.vmap(lambda d: rate(u, d))(opponents))(candidates), axis=1))
-    return problem.discount * value(x) - best
+    residual = problem.discount * value(x) - best
+    if problem.stopping_cost is None:
+        return residual
+    price = problem.stopping_cost(x) if callable(problem.stopping_cost) else problem.stopping_cost
+    return jnp.maximum(residual, value(x) - price)
 
 
 def equation_residuals(problem, value, states, candidates, opponents=None):
@@ -70,6 +82,14 @@ ANSWERS = [
     ("smooth", {"discount": 1.5}, 1e-5),
     ("merton", {}, 1e-10),
     ("merton", {"growth": 0.06, "aversion": 3.0, "interest": 0.02}, 1e-10),
+    ("merton-wealth", {}, 1e-10),
+    ("merton-wealth", {"growth": 0.06, "aversion": 3.0, "interest": 0.02}, 1e-10),
+    ("growth", {}, 1e-10),
+    ("growth", {"productivity": 0.8, "share": 0.6, "depreciation": 0.1, "discount": 0.07}, 1e-10),
+    ("perpetual-put", {}, 1e-10),
+    ("perpetual-put", {"strike": 40.0, "interest": 0.02, "volatility": 0.5}, 1e-10),
+    ("leland", {}, 1e-10),
+    ("leland", {"coupon": 3.0, "interest": 0.04, "volatility": 0.35, "payout": 0.0, "tax": 0.2}, 1e-10),
 ]
 
 
@@ -78,7 +98,10 @@ def candidate_controls(name, problem, parameters):
         return np.zeros((1, 0))
     if isinstance(problem.controls, Finite):
         return problem.controls.points
-    if name == "merton":
+    if name == "growth":  # the best consumption depends on the capital
+        share = zoo.Ramsey(**parameters).consumption
+        return share * np.linspace(*problem.controls.grid(2).points[:, 0] / share, 400_001)[:, None]
+    if name in ("merton", "merton-wealth"):
         known = {k: v for k, v in parameters.items() if k != "shape"}
         system = zoo.Merton(**known)
         best = [[float(system.share), float(system.consumption)]]
@@ -118,11 +141,13 @@ def test_a_wrong_answer_does_not_satisfy_the_equation(entry, sample_state):
     candidates = candidate_controls(entry.name, problem, {})
     opponents = problem.disturbances.grid(1001).points if problem.is_game else None
     x = sample_state(grid, 5, shrink=0.6)
-    # Fuel is not spent while coasting, so that equation is homogeneous: there the wrong value is one that leans.
-    lean = 0.01 if entry.name == "moon-landing" else 0.0
-    wrong = lambda y: 1.01 * value(y) + lean * y[1]  # noqa: E731
+    # Nothing is paid while the rocket coasts or the owner of a put waits, so that these equations are homogeneous, and
+    # a multiple of the value solves them.
+    bent = {"moon-landing": lambda y: 0.01 * y[1], "perpetual-put": lambda y: 1e-4 * y[0] ** 2}
+    more = bent.get(entry.name, lambda y: 0.0)
+    wrong = lambda y: 1.01 * value(y) + more(y)  # noqa: E731
     off = jax.jit(lambda x: equation_residual(problem, wrong, x, candidates, opponents))(x)
-    assert abs(off) > 1e-3 * min(1.0, float(jax.jit(value)(x)))
+    assert abs(off) > 1e-3 * min(1.0, abs(float(jax.jit(value)(x))))
 
 
 @pytest.mark.parametrize("entry", WITH_ANSWER, ids=name_of)
@@ -132,7 +157,8 @@ def test_the_answer_meets_the_exit_cost(entry):
         return
     nodes = grid.nodes().reshape(-1, grid.ndim)
     inside = nodes[np.asarray(jax.jit(jax.vmap(problem.target))(nodes)) <= 0]
-    given = problem.exit_cost if callable(problem.exit_cost) else lambda x: problem.exit_cost or 0.0
+    paid = problem.exit_cost if problem.payoff == "cost" else problem.exit_reward
+    given = paid if callable(paid) else lambda x: paid or 0.0
     found, wanted = jax.jit(jax.vmap(lambda x: (entry.exact()(x), given(x))))(inside)
     if entry.name == "moon-landing":  # a number is held where no landing is possible
         found = jnp.where(jnp.isinf(found), wanted, found)
@@ -151,6 +177,13 @@ def test_known_numbers():
     assert float(zoo.merton_exact()([0.0])) == pytest.approx(493.8271605, abs=1e-7)
     assert float(zoo.Merton().share) == pytest.approx(0.5)
     assert float(zoo.Merton().consumption) == pytest.approx(0.045)
+    assert float(zoo.merton_wealth_exact()([1.0])) == pytest.approx(-493.8271605, abs=1e-7)
+    assert float(zoo.perpetual_put_exact()([100.0])) == pytest.approx(23.21468, abs=5e-6)
+    assert float(zoo.AmericanPut().boundary) == pytest.approx(52.63158, abs=5e-6)
+    # without payout: Leland (1994)
+    assert float(zoo.Firm(payout=0.0).boundary) == pytest.approx(0.65 * 6.0 / (0.06 + 0.02), rel=1e-12)
+    assert float(zoo.growth_exact()([5.0])) == pytest.approx(52.4365730, abs=1e-6)
+    assert float(zoo.Ramsey().consumption) == pytest.approx(0.2, rel=1e-12)
     assert float(zoo.brownian_exit_exact(dim=2)([0.0, 0.0])) == pytest.approx(0.589370826, abs=1e-9)
     matrix = jax.hessian(zoo.double_integrator_lq_exact())(jnp.zeros(2)) / 2
     np.testing.assert_allclose(matrix, [[3**0.5, 1], [1, 3**0.5]], atol=1e-12)

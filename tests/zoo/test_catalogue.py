@@ -11,6 +11,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
+from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.sets import Ball, Finite
 from hjbjax.tracing import components
 
@@ -54,12 +55,13 @@ def test_the_catalogue_has_the_problems_under_hyphenated_names():
 @pytest.mark.parametrize("entry", ENTRIES, ids=name_of)
 def test_functions_have_the_promised_shapes(entry):
     problem, grid = entry.build()
+    problem = costs_of(problem)
     x = jnp.asarray(entry.initial_state(grid.ndim))
     assert np.all(x >= grid.lo)
     assert np.all(x <= grid.hi)
     inputs = arguments(problem, x)
     assert jax.eval_shape(problem.drift, *inputs).shape == (grid.ndim,)
-    assert jax.eval_shape(problem.cost, *inputs).shape == ()
+    assert problem.cost is None or jax.eval_shape(problem.cost, *inputs).shape == ()
     assert problem.diffusion(*inputs[:2]).shape[0] == grid.ndim
     if problem.target is not None:
         assert jax.eval_shape(problem.target, x).shape == ()
@@ -73,6 +75,7 @@ def test_functions_have_the_promised_shapes(entry):
 def test_functions_are_evaluated_by_components(entry, sample_state):
     # FallbackWarning is an error here, so this says that every primitive of the zoo has a component rule.
     problem, grid = entry.build()
+    problem = costs_of(problem)
     states = np.stack([np.asarray(sample_state(grid, seed)) for seed in range(3)])
     functions = [(problem.drift, True), (problem.cost, True), (problem.target, False), (problem.exit_cost, False)]
 
@@ -113,9 +116,11 @@ def test_another_parameter_is_the_same_structure(entry, name):
 def test_a_parameter_may_be_a_tracer(entry, name, sample_state):
     def evaluate(parameter):
         problem, grid = entry.build(**{name: parameter})
+        problem = costs_of(problem)
         inputs = arguments(problem, x)
-        values = [problem.drift(*inputs), problem.cost(*inputs), problem.diffusion(*inputs[:2]), problem.discount]
-        values += [f(x) for f in (problem.target, problem.exit_cost) if callable(f)]
+        values = [problem.drift(*inputs), problem.diffusion(*inputs[:2]), problem.discount]
+        values += [problem.cost(*inputs)] if problem.cost is not None else []
+        values += [f(x) for f in (problem.target, problem.exit_cost, problem.stopping_cost) if callable(f)]
         return [*values, *(jnp.asarray(bound) for bound in (grid.lo, grid.hi))]
 
     number = 1.25 * entry.parameters[name] or 0.25
@@ -191,6 +196,13 @@ def test_importing_the_zoo_loads_nothing_heavy():
         (lambda: zoo.brownian_ball(radius=0.0), "radius = 0.0"),
         (lambda: zoo.merton(volatility=0.0), "volatility = 0.0"),
         (lambda: zoo.manipulator(links=2, shape=(20, 21)), "lengths 4, 4, 2"),
+        (lambda: zoo.merton_wealth(growth=0.2), "best share is 2.125,"),
+        (lambda: zoo.growth(share=1.2), "share = 1.2, wanted a number between 0 and 1"),
+        (lambda: zoo.growth(discount=0.0), "discount = 0.0"),
+        (lambda: zoo.perpetual_put(volatility=-0.1), "volatility = -0.1"),
+        (lambda: zoo.american_put(maturity=0.0), "maturity = 0.0"),
+        (lambda: zoo.leland(tax=1.0), r"tax = 1.0, wanted a number in \[0, 1\)"),
+        (lambda: zoo.leland_exact(payout=-0.01), "payout = -0.01"),
         (lambda: zoo.merton(growth=0.2), r"best share is 2.125, wanted one within \[0, 1\]"),
         (lambda: zoo.merton_exact(aversion=0.5), "best share is 2,"),
         (lambda: zoo.merton(discount=0.3), r"best consumption is 0.17, wanted one within \[0.01, 0.1\]"),

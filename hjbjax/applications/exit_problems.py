@@ -17,7 +17,7 @@ import numpy as np
 
 from hjbjax.feedback.feedback import GridFeedback, Place, check_kept, is_grid_feedback
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import altered, as_partial, is_traced, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Disturbance, Number, State
 
 T = TypeVar("T", bound=Callable | None)
@@ -25,7 +25,7 @@ T = TypeVar("T", bound=Callable | None)
 
 @pytree_dataclass(static=("marched", "timed"))
 class ClosedLoop:
-    """A problem's drift and noise under a feedback; where the feedback is NaN, the state does not move.
+    """A problem's drift, noise and rates under a feedback; where the feedback is NaN, the state does not move.
 
     Args:
       problem: the problem.
@@ -51,6 +51,11 @@ class ClosedLoop:
         # without an action switch the noise off as well, otherwise it might carry the state into the target
         sigma = self.problem.noise
         return jnp.where(acts, jnp.asarray(sigma(*self.problem.arguments(x, u, d, t)) if callable(sigma) else sigma), 0)
+
+    def mode_rates(self, *arguments: Array) -> jax.Array:
+        """The rates of changes of the mode, shape (k − 1,)."""
+        t, x, u, d, acts = self._actions(arguments)
+        return jnp.where(acts, jnp.asarray(self.problem.mode_rates(*self.problem.arguments(x, u, d, t))), 0)
 
     def _actions(self, arguments: tuple[Array, ...]) -> tuple[Number, State, Control, Disturbance | None, jax.Array]:
         """The time, the state, the control, the disturbance, and True if there is a control."""
@@ -95,13 +100,14 @@ def close_loop(problem: Problem, feedback: GridFeedback | Callable, horizon: Num
     # where a Solution is NaN the state must not move, so the noise is zero there; a function always gives a control, so
     # a constant noise need not change
     looped = problem.noise is not None and (is_grid_feedback(feedback) or callable(problem.noise))
-    return Problem(
+    closed = Problem(
         # no cost and no controls; the disturbance plays against the closed loop
         loop.drift, None, None, disturbances=problem.disturbances,
         noise=loop.noise if looped else problem.noise,
         isaacs=problem.isaacs,
         time_dependent=loop.timed,
     )  # fmt: skip
+    return closed if problem.mode_rates is None else altered(closed, mode_rates=as_partial(loop.mode_rates))
 
 
 def exit_problem(
@@ -119,12 +125,13 @@ def exit_problem(
     sets = (target,) if obstacle is None else (target, obstacle)
     # use None for zero, because a function cannot be recognised as zero
     paid = jax.tree_util.Partial(_exit_cost, exit_cost, sets) if exit_cost else None
-    return Problem(
+    question = Problem(
         # no discount, because probabilities and times are not discounted
         problem.drift, jax.tree_util.Partial(_constant, cost) if cost else None, problem.controls,
         disturbances=problem.disturbances, noise=problem.noise, target=jax.tree_util.Partial(_nearest, sets),
         exit_cost=paid, isaacs=problem.isaacs, time_dependent=problem.time_dependent,
     )  # fmt: skip
+    return altered(question, mode_rates=problem.mode_rates)
 
 
 def arrival(problem: Problem, target: Callable, obstacle: Callable | None) -> Problem:

@@ -24,8 +24,8 @@ from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.iteration.methods import ValueIteration
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, front_door, is_traced
+from hjbjax.problem.problem import Problem, is_random
+from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import keeping_warnings
@@ -86,8 +86,8 @@ def reach_probability(
       A Solution whose value is the probability and whose policy attains it.
 
     Raises:
-      ValueError: there is no target, the grid has open ends, a feedback is given for a problem without controls, or
-        ``march`` or ``solve`` refuse.
+      ValueError: there is no target, the grid has open ends, a feedback is given for a problem without controls, the
+        modes have a switching cost, or ``march`` or ``solve`` refuse.
       SolveError: no convergence, with the partial solution.
 
     Example:
@@ -196,8 +196,8 @@ def expected_exit_time(
       A Solution whose value is the time, inf where the target is not reached with certainty.
 
     Raises:
-      ValueError: there is no target, the grid has open ends, or ``solve`` or ``march`` refuse. With ``greatest``: the
-        control can stay away indefinitely, in a game possibly with the help of the disturbance; this is not checked
+      ValueError: there is no target, the grid has open ends, the modes have a switching cost, or ``solve`` or
+        ``march`` refuse. With ``greatest``: the control can stay away indefinitely, in a game possibly with the help of the disturbance; this is not checked
         inside ``jit``.
       SolveError: no convergence, with the partial solution.
 
@@ -249,6 +249,12 @@ def _system(
     # check here, because its target is read before ``solve`` checks the problem
     if not isinstance(problem, Problem):
         raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
+    if problem.switching_costs is not None:
+        raise ValueError(
+            f"{name}: got modes with a switching_cost; wanted modes that change only at random, because a probability "
+            "or a time\ncannot be added to a cost. Leave out switching_cost, or let the control set the rates: "
+            "Modes(names, rates=lambda x, u: ...)"
+        )
     inside = problem.target if target is None else as_partial(target, f"{name}: target")
     if inside is None:
         raise ValueError(f"{name}: there is nothing to reach: pass target=, a function ≤ 0 inside, or problem.target")
@@ -285,12 +291,12 @@ def _without_end(question: Problem, grid: Grid, least: bool, options: dict) -> t
     # P is at least zero and −P at most zero, so the bound does not change the value
     bound: dict[str, Any] = {"running_max" if least else "stopping_cost": jax.tree_util.Partial(_zero)}
     # another method may find another solution; a method that the caller passes is used all the same
-    return dataclasses.replace(question, **bound), {"method": ValueIteration()} | options
+    return altered(question, **bound), {"method": ValueIteration()} | options
 
 
 def _has_no_chance(problem: Problem, options: dict) -> bool:
-    """True if the system has no noise, and the caller passed neither scheme nor method."""
-    return problem.noise is None and options.get("scheme") is None and options.get("method") is None
+    """True if nothing in the system is random, and the caller passed neither scheme nor method."""
+    return not is_random(problem) and options.get("scheme") is None and options.get("method") is None
 
 
 def _yes_or_no(

@@ -57,7 +57,8 @@ def generator(
       A SciPy CSR array of shape (S, S), per unit time.
 
     Raises:
-      ValueError: the policy has the wrong shape, rates are not finite, or the chain cannot represent the noise.
+      ValueError: the policy has the wrong shape, rates are not finite, the chain cannot represent the noise, or the
+        modes have a switching cost.
     """
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
     return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
@@ -281,7 +282,7 @@ def transition_arrays(
     is one. Drift and costs are divided by β and the noise by √β, so that all states have the same factor.
 
     Args:
-      problem: discounted, without disturbances or constraints, with K ``Finite`` controls, or None (K = 1).
+      problem: discounted, without disturbances, constraints or switching costs of modes, with K ``Finite`` controls, or None (K = 1).
       grid: the grid, S nodes.
       scheme: the chain that defines the rates.
 
@@ -402,6 +403,12 @@ def _rates_in_program(problem: Problem, grid: Grid, actions: tuple, scheme: Chai
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
     """The rates under a policy; zero on the target and at nodes without an action."""
     checks.check_indices(grid)
+    if problem.switching_costs is not None:
+        raise ValueError(
+            "chain: got modes with a switching_cost; a policy does not hold the changes of the mode that the controller "
+            "makes at once,\nso the rates would lack them. Wanted modes that change only at random: leave out "
+            "switching_cost"
+        )
     u, d, active = decision_process.policy_components(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
     # the dtype of the policy determines what counts as rounding: float32 is off by 1e-7 at an end

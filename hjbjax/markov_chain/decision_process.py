@@ -136,6 +136,11 @@ def action_table(problem: Problem) -> np.ndarray:
     if is_constrained(problem):
         what = problem.labels.word("a stopping_cost or running_max")
         raise ValueError(f"transition_arrays: got {what}, which a decision problem cannot hold")
+    if problem.switching_costs is not None:
+        raise ValueError(
+            "transition_arrays: got modes with a switching_cost, which takes effect at once, while an action of a "
+            "decision problem\ntakes a time step; leave out switching_cost, or let the control set the rates of the modes"
+        )
     if problem.time_dependent:
         raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")
     if problem.controls is None:

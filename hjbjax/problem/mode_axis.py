@@ -78,8 +78,17 @@ def over_modes(problem: Problem, n: int) -> Problem:
 
 
 def with_modes(grid: Grid, names: Sequence[str]) -> Grid:
-    """The grid with the modes as its first axis, periodic, with nodes 0, 1, ..., k − 1; unchanged without names."""
+    """The grid with the modes as its first axis, periodic, with nodes 0, 1, ..., k − 1; unchanged without names.
+
+    Raises:
+      ValueError: the grid has an axis of other modes.
+    """
     count = len(names)
+    if count and grid.modes and grid.modes != tuple(names):
+        raise ValueError(
+            f"grid: got a grid with the modes {grid.modes!r}, but the problem has the modes {tuple(names)!r}; wanted "
+            "the same modes,\nor a grid without modes, such as the one that was passed to solve"
+        )
     if not count or grid.modes:
         return grid
     xp: Any = jnp if is_traced(grid.lo, grid.hi) else np

@@ -29,6 +29,7 @@ from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.mode_axis import of_mode, with_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, is_traced
 from hjbjax.problem.types import Numbers
@@ -177,14 +178,14 @@ def convergence_study(
     Args:
       problem: the problem.
       grids: at least two grids of the same box in any order, refined by the same factor along every axis.
-      reference: the value as a function of one state, or a converged ``Solution`` on a finer grid, interpolated
+      reference: the value as a function of one state, and of the mode if there are modes, or a converged ``Solution`` on a finer grid, interpolated
         linearly between its nodes. ``None`` uses Richardson's estimate from the three finest grids. The number of
         intervals of every grid must then be a multiple of the number on the coarsest grid, as with 41, 81 and 161
         nodes.
       scheme: as in ``solve``.
       method: as in ``solve``.
       tol: as in ``solve``; it must be small, so that errors come from the grid and not from the iteration.
-      region: the region where errors count: a boolean function of one state, or the fraction of the box around its
+      region: the region where errors count: a boolean function of one state, and of the mode, or the fraction of the box around its
         centre along every axis that is not periodic, 0.5 for its inner half; ``None`` is everywhere.
 
     Returns:
@@ -208,6 +209,9 @@ def convergence_study(
     if is_traced(problem, grids, reference):  # seconds, statuses and masks must be concrete
         raise ValueError("convergence_study: it runs at host level only, outside of jit, vmap and grad")
     ordered = _sort(grids)
+    if isinstance(problem, Problem) and problem.modes is not None:
+        ordered = tuple(with_modes(grid, problem.modes.names) for grid in ordered)
+        reference, region = of_mode(reference, problem.modes), of_mode(region, problem.modes)
     check_reference(reference, ordered)  # before any solve, because a late error would waste the time of the solves
     compared = ordered if reference is not None else ordered[:1] * len(ordered)  # the estimate is on the coarsest grid
     masks = [mask_of(region, grid) for grid in compared]

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem.mode_axis import refuse_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, front_door, numbers
 from hjbjax.problem.rewards import refuse_rewards
@@ -43,7 +44,7 @@ def attenuation(
       The game. The disturbance chooses after the control, which makes no difference here.
 
     Raises:
-      ValueError: the problem has disturbances or no cost, or the level is not positive.
+      ValueError: the problem has modes, disturbances or no cost, or the level is not positive.
 
     Example:
       >>> import hjbjax as hjb
@@ -54,6 +55,7 @@ def attenuation(
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"attenuation: got {type(problem).__name__}, wanted a Problem without disturbances")
+    refuse_modes(problem)
     refuse_rewards(
         problem, "attenuation", "an L₂ gain is about the energy ½|z|² of an output, which the control keeps small"
     )

@@ -23,6 +23,7 @@ from hjbjax.discretisation.discretisation import Scheme
 from hjbjax.discretisation.schemes import Limited, check_slopes
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.mode_axis import refuse_modes
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import front_door
 from hjbjax.problem.rewards import refuse_rewards
@@ -138,8 +139,8 @@ def perturbation_study(
       The study; ``hjb.plotting.perturbation(study)`` draws both lines in one plot.
 
     Raises:
-      ValueError: there are fewer than two noises or levels; the problem has noise or disturbances, or no discount; the
-        set of disturbances is saturated in the region; or ``solve`` refuses.
+      ValueError: there are fewer than two noises or levels; the problem has modes, noise or disturbances, or no discount;
+        the set of disturbances is saturated in the region; or ``solve`` refuses.
       SolveError: the study was interrupted; ``.solution`` is the study so far, or the unperturbed solution.
 
     Example:
@@ -152,6 +153,7 @@ def perturbation_study(
     """
     check_arguments(problem, grid, method, scheme, tol)
     check_slopes(scheme, "perturbation_study: scheme")
+    refuse_modes(problem)
     refuse_rewards(problem, "perturbation_study", "an L₂ gain is about the energy of an output, which is a cost")
     levels = _parameters("noises", noises), _parameters("gammas", gammas)
     if problem.is_game or problem.noise is not None:

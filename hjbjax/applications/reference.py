@@ -25,14 +25,16 @@ FLATTEST, STEEPEST = 1e-3, 16.0  # range of orders for Richardson extrapolation;
 
 def mean_spacing(grid: Grid) -> float:
     """The geometric mean of the mean spacings of the axes; ratios of two of them do not depend on the units."""
-    return float(np.prod(mean_spacings(grid)) ** (1 / grid.ndim))  # n-th root of the cell's volume
+    spacings = mean_spacings(grid)
+    return float(np.prod(spacings) ** (1 / len(spacings)))  # n-th root of the cell's volume
 
 
 def mean_spacings(grid: Grid) -> np.ndarray:
-    """The mean spacing along every axis, shape (n,)."""
+    """The mean spacing along every axis of the state, shape (n,); modes have none."""
     # the mean for a stretched axis; refinement shrinks all of its spacings by about the same factor
-    counts = np.array([grid.intervals(axis) for axis in range(grid.ndim)])
-    return (np.asarray(grid.hi) - np.asarray(grid.lo)) / counts
+    axes = list(grid.state_axes)
+    counts = np.array([grid.intervals(axis) for axis in axes])
+    return (np.asarray(grid.hi)[axes] - np.asarray(grid.lo)[axes]) / counts
 
 
 def check_same_box(what: str, first: Grid, second: Grid) -> None:

@@ -82,7 +82,7 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
 
     Raises:
       TypeError: an argument that is not a Solution, or a nominal control that cannot be called.
-      ValueError: a solution of a problem that is not a tube; a tube that has no controls, did not converge, is safe
+      ValueError: a solution of a problem that is not a tube; a tube that has modes, has no controls, did not converge, is safe
         nowhere, or was marched and stored at only one time; a margin that is negative or NaN.
 
     Example:
@@ -101,6 +101,11 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
         raise ValueError(
             "least_restrictive: got the solution of a problem that is not a tube; its V ≤ 0 does not mean safe. "
             "Pass the solution of hjb.avoid(...), hjb.reach_avoid(...) or hjb.reach(...), with tube=True"
+        )
+    if solution.grid.modes:
+        raise ValueError(
+            f"least_restrictive: got a tube with the modes {solution.grid.modes!r}, but a filter is a function of the "
+            "state only; pass the tube of one mode, solution.in_mode(...), if the mode is known"
         )
     control = _nominal(nominal)
     if solution.times is not None and np.size(solution.times) < 2:

@@ -21,14 +21,37 @@ def states_in_mode(grid: Grid, x: Numbers, mode: str | int, name: str) -> Array:
     """States x, shape (..., n), as states (i, x) in one mode, shape (..., n + 1).
 
     Raises:
-      ValueError: the grid has no such mode.
+      ValueError: the grid has no such mode, or states of the wrong length.
     """
-    number = mode_number(grid, mode, name)
+    number, n = mode_number(grid, mode, name), grid.ndim - 1
     xp: Any = jnp if is_traced(x) else np
     states = xp.asarray(x)
-    if states.ndim == 0:
-        return states  # refused like any state without axes
+    if states.shape[-1:] != (n,):
+        raise ValueError(f"{name}: got states of shape {states.shape}, wanted (..., {n}): one entry per state")
     return xp.concatenate([xp.full((*states.shape[:-1], 1), number, states.dtype), states], axis=-1)
+
+
+def refuse_unknown_modes(grid: Grid, x: Numbers, name: str) -> None:
+    """Refuse states without a mode, and states that begin with a number that is not a mode; traced ones pass.
+
+    Raises:
+      ValueError: names the modes.
+    """
+    shape, n = np.shape(x), grid.ndim - 1
+    if not grid.modes:
+        return
+    if shape[-1:] == (n,) or not shape:
+        raise ValueError(
+            f"{name}: got states of shape {shape} without a mode; give it, as in mode={grid.modes[0]!r}: the problem "
+            f"has the modes {grid.modes!r}"
+        )
+    if shape[-1] == n + 1 and not is_traced(x):
+        numbers = np.asarray(x)[..., 0]
+        if not np.all(np.isin(numbers, np.arange(len(grid.modes)))):
+            raise ValueError(
+                f"{name}: got states that begin with the mode {numbers.tolist()!r:.60}, wanted whole numbers from 0 to "
+                f"{len(grid.modes) - 1}"
+            )
 
 
 def of_one_mode(solution: Any, mode: str | int) -> Any:

@@ -34,7 +34,7 @@ from hjbjax.solution.interpolation import (
     slopes_between,
     times_outside,
 )
-from hjbjax.solution.modes import of_one_mode, states_in_mode, switching_modes
+from hjbjax.solution.modes import of_one_mode, refuse_unknown_modes, states_in_mode, switching_modes
 from hjbjax.solution.placement import Path
 from hjbjax.solution.status import Status, warn
 
@@ -231,7 +231,8 @@ class Solution:
           Shape ``x.shape[:-1]``, in cost units.
 
         Raises:
-          ValueError: a state of the wrong length, a missing or unneeded time, or a batch of solutions.
+          ValueError: a state of the wrong length, a missing or unknown mode, a missing or unneeded time, or a batch of
+            solutions.
           TypeError: the states are not numbers.
         """
         return self._query("value_at", between, self.value, 0, where, clamp, mode)
@@ -274,6 +275,7 @@ class Solution:
         t, x = check_query(self, name, values, trailing, where)
         if mode is not None:
             x = states_in_mode(self.grid, x, mode, f"Solution.{name}")
+        refuse_unknown_modes(self.grid, x, f"Solution.{name}")
         samples = Samples(self.grid, values, self.times)
         found = query(look, samples, x, t, clamp=clamp, name=f"Solution.{name}")
         known = not clamp and t is not None and not is_traced(found, t, self.times)

@@ -379,3 +379,93 @@ def test_mistakes_are_refused_with_the_mode():
     negative = hjb.Modes(("a", "b"), rates=lambda x, u: jnp.array([[0.0, 1.0], [1.0, 0.0]]) * x[0])
     with pytest.raises(ValueError, match=r"Modes.rates.*negative"):
         hjb.solve(hjb.Problem(lambda x, u, mode: 0 * x, modes=negative, discount=1.0), LINE)
+
+
+def drifting(modes, **others):
+    """The state stands still in the first mode and moves to the right in the second."""
+    return hjb.Problem(
+        lambda x, u, mode: (0.0, 1.0)[mode] + 0 * x, noise=lambda x, u, mode: (0.0, 0.5)[mode] + 0 * x, modes=modes,
+        **others,
+    )  # fmt: skip
+
+
+def test_probabilities_count_random_changes_of_the_mode():
+    # from the last node before the target the drive moves on at the rate 1/h or breaks down at the rate λ, for good
+    grid, rate = hjb.Grid([-1.0], [1.0], (7,)), 0.2
+    problem = drifting(hjb.Modes(("park", "drive"), rates=[[0, 0], [rate, 0]]))
+    found = hjb.reach_probability(problem, grid, lambda x, mode: 0.9 - x[0], obstacle=lambda x, mode: x[0] + 0.9)
+    ahead = (1 / grid.spacing(0)) / (1 / grid.spacing(0) + rate)
+    assert np.allclose(found.value[1, 2:], ahead ** np.arange(4, -1, -1), rtol=0, atol=1e-6)
+    assert np.all(found.value[0, :-1] == 0)
+    still = hjb.Problem(lambda x, u, mode: 0 * x, modes=problem.modes)
+    driving = hjb.stay_probability(still, grid, lambda x, mode: 0.5 - mode + 0 * x[0], horizon=1.0, step=1e-3)
+    assert np.allclose(driving.value[0, 1], np.exp(-rate), rtol=0, atol=1e-3)
+
+
+def test_a_feedback_sees_the_changes_of_the_mode():
+    # nothing moves until the mode changes into the target: E τ = 1/λ(u)
+    problem = hjb.Problem(
+        lambda x, u, mode: 0 * x, controls=hjb.Box([1.0], [2.0]), target=lambda x, mode: 0.5 - mode + 0 * x[0],
+        modes=hjb.Modes(("works", "broken"), rates=lambda x, u: jnp.array([[0.0, 0.25], [0.0, 0.0]]) * u[0]),
+    )  # fmt: skip
+    grid = hjb.Grid([0.0], [1.0], (3,))
+    for options, time in (({"feedback": lambda x, mode: jnp.ones(1)}, 4.0), ({}, 2.0)):
+        found = hjb.expected_exit_time(problem, grid, **options)
+        assert np.allclose(found.value, [[time] * 3, [0.0] * 3])
+
+
+def test_tables_without_changes_by_choice_are_refused():
+    problem, grid = plant([[0, 0.5], [0.8, 0]]), hjb.Grid([-2.0], [2.0], (5,))
+    zeros = np.zeros((2, 5, 1))
+    for function in (hjb.chain.generator, hjb.chain.matrix, hjb.chain.stationary_density):
+        with pytest.raises(ValueError, match="got modes with a switching_cost"):
+            function(problem, grid, zeros)
+    few = dataclasses.replace(problem, controls=hjb.Finite([[-1.0], [1.0]]))
+    with pytest.raises(ValueError, match="transition_arrays: got modes with a switching_cost"):
+        hjb.chain.transition_arrays(few, grid)
+    for function in (hjb.reach_probability, hjb.expected_exit_time):
+        with pytest.raises(ValueError, match=f"{function.__name__}: got modes with a switching_cost"):
+            function(problem, grid, lambda x, mode: x[0])
+
+
+def test_functions_that_do_not_know_modes_refuse_them():
+    problem, grid = plant([[0, 0.5], [0.8, 0]]), hjb.Grid([-2.0], [2.0], (5,))
+    with pytest.raises(ValueError, match="got a problem with the modes"):
+        hjb.attenuation(problem, 2.0, hjb.Box([-1.0], [1.0]))
+    with pytest.raises(ValueError, match="got a problem with the modes"):
+        hjb.perturbation_study(problem, grid, noises=[0.1, 0.2], gammas=[3.0, 4.0], disturbances=hjb.Box([-1.0], [1.0]))
+    tube = hjb.Problem(
+        lambda x, u, mode: u, None, hjb.Box([-1.0], [1.0]), running_max=lambda x, mode: x[0],
+        modes=hjb.Modes(("a", "b"), rates=[[0, 1], [1, 0]]),
+    )  # fmt: skip
+    found = hjb.march(tube, grid, 0.1, times=np.linspace(0, 0.1, 3), scheme=CHAIN)
+    with pytest.raises(ValueError, match="got a tube with the modes"):
+        hjb.least_restrictive(found, lambda t, x: 0 * x)
+
+
+def test_a_grid_of_other_modes_is_refused():
+    grid = hjb.Grid([-2.0], [2.0], (5,))
+    named = hjb.solve(plant([[0, 0.5], [0.8, 0]]), grid, tol=1e-3).grid
+    other = hjb.Modes(("park", "drive"), rates=np.ones((2, 2)))
+    with pytest.raises(ValueError, match="got a grid with the modes"):
+        hjb.solve(drifting(other, discount=1.0), named)
+
+
+def test_states_without_a_mode_or_with_an_unknown_one_are_refused(solved):
+    _, found = solved
+    with pytest.raises(ValueError, match="without a mode; give it, as in mode='calm'"):
+        found.value_at([0.3])
+    with pytest.raises(ValueError, match=r"got states of shape \(2,\), wanted \(..., 1\)"):
+        found.value_at([1.0, 0.3], mode="wild")
+    for number in (2.0, 0.5, -1.0):
+        with pytest.raises(ValueError, match="begin with the mode"):
+            found.value_at([number, 0.3])
+
+
+def test_a_convergence_study_compares_every_mode():
+    problem = dataclasses.replace(plant([[0, 0.5], [0.8, 0]]), noise=0.5)
+    grids = [hjb.Grid([-2.0], [2.0], (n,)) for n in (5, 9, 17)]
+    study = hjb.convergence_study(problem, grids, region=lambda x, mode: jnp.abs(x[0]) < 1.5)
+    assert np.allclose(study.h, [1.0, 0.5, 0.25])
+    assert study.solutions[0].value.shape == (2, 5)
+    assert np.all(np.diff(study.errors) < 0)

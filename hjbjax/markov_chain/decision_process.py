@@ -139,7 +139,7 @@ def action_table(problem: Problem) -> np.ndarray:
     if problem.switching_costs is not None:
         raise ValueError(
             "transition_arrays: got modes with a switching_cost, which takes effect at once, while an action of a "
-            "decision problem\ntakes a time step; leave out switching_cost, or let the control set the rates of the modes"
+            "decision problem\ntakes a time step; leave out switching_cost, or let the control set the rates"
         )
     if problem.time_dependent:
         raise ValueError("transition_arrays: got time_dependent=True, wanted a stationary problem")

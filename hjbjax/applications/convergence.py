@@ -178,15 +178,15 @@ def convergence_study(
     Args:
       problem: the problem.
       grids: at least two grids of the same box in any order, refined by the same factor along every axis.
-      reference: the value as a function of one state, and of the mode if there are modes, or a converged ``Solution`` on a finer grid, interpolated
-        linearly between its nodes. ``None`` uses Richardson's estimate from the three finest grids. The number of
-        intervals of every grid must then be a multiple of the number on the coarsest grid, as with 41, 81 and 161
-        nodes.
+      reference: the value as a function of one state, and of the mode if there are modes, or a converged ``Solution``
+        on a finer grid, interpolated linearly between its nodes. ``None`` uses Richardson's estimate from the three
+        finest grids. The number of intervals of every grid must then be a multiple of the number on the coarsest grid,
+        as with 41, 81 and 161 nodes.
       scheme: as in ``solve``.
       method: as in ``solve``.
       tol: as in ``solve``; it must be small, so that errors come from the grid and not from the iteration.
-      region: the region where errors count: a boolean function of one state, and of the mode, or the fraction of the box around its
-        centre along every axis that is not periodic, 0.5 for its inner half; ``None`` is everywhere.
+      region: the region where errors count: a boolean function of one state, and of the mode, or the fraction of the
+        box around its centre along every axis that is not periodic, 0.5 for its inner half; ``None`` is everywhere.
 
     Returns:
       The study: ``.h``, ``.errors``, ``.order`` and the rest; ``print(study)`` shows the table and

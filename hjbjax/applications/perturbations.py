@@ -139,8 +139,8 @@ def perturbation_study(
       The study; ``hjb.plotting.perturbation(study)`` draws both lines in one plot.
 
     Raises:
-      ValueError: there are fewer than two noises or levels; the problem has modes, noise or disturbances, or no discount;
-        the set of disturbances is saturated in the region; or ``solve`` refuses.
+      ValueError: there are fewer than two noises or levels; the problem has modes, noise or disturbances, or no
+        discount; the set of disturbances is saturated in the region; or ``solve`` refuses.
       SolveError: the study was interrupted; ``.solution`` is the study so far, or the unperturbed solution.
 
     Example:

@@ -196,9 +196,9 @@ def expected_exit_time(
       A Solution whose value is the time, inf where the target is not reached with certainty.
 
     Raises:
-      ValueError: there is no target, the grid has open ends, the modes have a switching cost, or ``solve`` or
-        ``march`` refuse. With ``greatest``: the control can stay away indefinitely, in a game possibly with the help of the disturbance; this is not checked
-        inside ``jit``.
+      ValueError: there is no target, the grid has open ends, the modes have a switching cost, or ``solve`` or ``march``
+        refuse. With ``greatest``: the control can stay away indefinitely, in a game possibly with the help of the
+        disturbance; this is not checked inside ``jit``.
       SolveError: no convergence, with the partial solution.
 
     Example:

@@ -82,8 +82,8 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
 
     Raises:
       TypeError: an argument that is not a Solution, or a nominal control that cannot be called.
-      ValueError: a solution of a problem that is not a tube; a tube that has modes, has no controls, did not converge, is safe
-        nowhere, or was marched and stored at only one time; a margin that is negative or NaN.
+      ValueError: a solution of a problem that is not a tube; a tube that has modes, has no controls, did not converge,
+        is safe nowhere, or was marched and stored at only one time; a margin that is negative or NaN.
 
     Example:
       >>> import hjbjax as hjb

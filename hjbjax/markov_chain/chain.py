@@ -282,7 +282,8 @@ def transition_arrays(
     is one. Drift and costs are divided by β and the noise by √β, so that all states have the same factor.
 
     Args:
-      problem: discounted, without disturbances, constraints or switching costs of modes, with K ``Finite`` controls, or None (K = 1).
+      problem: discounted, without disturbances, constraints or switching costs of modes, with K ``Finite`` controls, or
+        None (K = 1).
       grid: the grid, S nodes.
       scheme: the chain that defines the rates.
 
@@ -389,6 +390,7 @@ def _at(action: Any, k: Any) -> Any:
 def _rates_in_program(problem: Problem, grid: Grid, actions: tuple, scheme: Chain, t: Any) -> Rates:
     """The rates under a policy inside a JAX transformation; NaN if they are refused at host level."""
     _refuse_ends(grid)
+    _refuse_changes(problem)
     u, d, active = decision_process.policy_components(problem, grid, *actions)
     dtype = np.dtype(jnp.result_type(float))
     on, u, d = cast((Discretisation(problem, grid, scheme, dtype, t), u, d), dtype)
@@ -400,15 +402,19 @@ def _rates_in_program(problem: Problem, grid: Grid, actions: tuple, scheme: Chai
     return Rates(jumps.offsets, tuple(values))
 
 
+def _refuse_changes(problem: Problem) -> None:
+    """Refuse changes of the mode by the controller, which a policy does not hold."""
+    if problem.switching_costs is not None:
+        raise ValueError(
+            "chain: got modes with a switching_cost; a policy does not hold the changes of the mode by the controller,\n"
+            "so the rates would lack them. Wanted modes that change only at random: leave out switching_cost"
+        )
+
+
 def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, scheme: Chain, t: float) -> Rates:
     """The rates under a policy; zero on the target and at nodes without an action."""
     checks.check_indices(grid)
-    if problem.switching_costs is not None:
-        raise ValueError(
-            "chain: got modes with a switching_cost; a policy does not hold the changes of the mode that the controller "
-            "makes at once,\nso the rates would lack them. Wanted modes that change only at random: leave out "
-            "switching_cost"
-        )
+    _refuse_changes(problem)
     u, d, active = decision_process.policy_components(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
     # the dtype of the policy determines what counts as rounding: float32 is off by 1e-7 at an end

@@ -406,7 +406,7 @@ def _refuse_changes(problem: Problem) -> None:
     """Refuse changes of the mode by the controller, which a policy does not hold."""
     if problem.switching_costs is not None:
         raise ValueError(
-            "chain: got modes with a switching_cost; a policy does not hold the changes of the mode by the controller,\n"
+            "chain: got modes with a switching_cost; a policy does not hold changes of the mode by the controller,\n"
             "so the rates would lack them. Wanted modes that change only at random: leave out switching_cost"
         )
 

@@ -252,11 +252,14 @@ def _through_changes(
         return _advance(loop, stepping, solve, (t, end, last), y, u)
 
     def on(carry: tuple) -> tuple:
-        t, y, _, made, _ = carry
-        now = u if stepping.held else loop.players(t, y[:-1])[0]
-        t, y, code, more, seen = _advance(loop, stepping, solve, (t, end, last), y, now)
-        y = jnp.where(code == CHANGE, after_changes(loop, t, y, start), y)
-        return t, y, code.astype(jnp.int32), made + more, seen
+        # under vmap a path that has finished its interval is computed too, and must not step beyond the Brownian path
+        again = carry[2] == CHANGE
+        begun, at = jnp.where(again, carry[0], t), jnp.where(again, carry[1], y)
+        now = u if stepping.held else loop.players(begun, at[:-1])[0]
+        later, moved, code, more, seen = _advance(loop, stepping, solve, (begun, end, last), at, now)
+        moved = jnp.where(code == CHANGE, after_changes(loop, later, moved, start), moved)
+        code = jnp.where((code == CHANGE) & (later >= end), PathStatus.DURATION, code)
+        return later, moved, code.astype(jnp.int32), carry[3] + more, seen
 
     def changes(carry: tuple) -> jax.Array:
         return (carry[2] == CHANGE) & (carry[3] < stepping.max_steps)

@@ -171,7 +171,7 @@ def switching_surplus(problem: Problem, feedback: object) -> Lookup | None:
 
 def _costs_at_nodes(problem: Problem, grid: Grid, dtype: Any, times: Any) -> list[Array]:
     """The costs of changing the mode by 1, ..., k − 1, (*grid) each, in a time-dependent march (times, *grid)."""
-    nodes = jnp.asarray(grid.nodes(), dtype).reshape(-1, grid.ndim)
+    nodes = jnp.stack(jnp.broadcast_arrays(*grid.components(dtype)), axis=-1).reshape(-1, grid.ndim)
 
     def at(t: Number) -> Array:
         found = jax.vmap(lambda z: problem.switching_costs(*problem.state_arguments(z, t)))(nodes)

@@ -338,16 +338,15 @@ def mean_cost(problem, found, start, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["random changes", "both, without noise", "both"])
+@pytest.mark.optimised
+@pytest.mark.parametrize("kind", ["both, without noise", "both"])
 def test_paths_cost_what_the_value_promises_in_the_mean(kind):
-    for seed in range(7):
-        one = random_modes.draw(seed, (161,))
-        one = dataclasses.replace(one, a=-np.abs(one.a), discount=0.8 + one.discount)  # paths stay in the box
-        problem = random_modes.problem(one, **KINDS[kind])
-        found, start = hjb.solve(problem, one.grid), [0.3 * float(one.grid.lo[0])]
-        mean, spread = mean_cost(problem, found, start, seed)
-        allowed = spread + float(np.max(found.grid_error)) + 0.01 * np.ptp(found.value)
-        assert abs(mean - found.value_at(start, mode="low")) <= allowed, seed
+    one = random_modes.draw(len(kind), (161,))
+    one = dataclasses.replace(one, a=-np.abs(one.a), discount=0.8 + one.discount)  # paths stay in the box
+    problem = random_modes.problem(one, **KINDS[kind])
+    found, start = hjb.solve(problem, one.grid), [0.3 * float(one.grid.lo[0])]
+    mean, spread = mean_cost(problem, found, start, 0)
+    assert abs(mean - found.value_at(start, mode="low")) <= spread + 0.01 * np.ptp(found.value)
 
 
 def test_mistakes_are_refused_with_the_mode():

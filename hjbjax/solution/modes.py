@@ -37,15 +37,18 @@ def refuse_unknown_modes(grid: Grid, x: Numbers, name: str) -> None:
     Raises:
       ValueError: names the modes.
     """
-    shape, n = np.shape(x), grid.ndim - 1
-    if not grid.modes:
+    if not grid.modes or is_traced(x):
+        return
+    try:
+        shape, n = np.shape(x), grid.ndim - 1
+    except ValueError:  # rows of different lengths, which the interpolation refuses
         return
     if shape[-1:] == (n,) or not shape:
         raise ValueError(
             f"{name}: got states of shape {shape} without a mode; give it, as in mode={grid.modes[0]!r}: the problem "
             f"has the modes {grid.modes!r}"
         )
-    if shape[-1] == n + 1 and not is_traced(x):
+    if shape[-1] == n + 1:
         numbers = np.asarray(x)[..., 0]
         if not np.all(np.isin(numbers, np.arange(len(grid.modes)))):
             raise ValueError(

@@ -68,6 +68,10 @@ class Obstacles:
             value = jnp.minimum(value, self.upper)
         if self.switching:
             value = self.after_changes(jnp.where(self.fixed, self.fixed_value, value))
+            # the certificate distinguishes nodes where the mode is changed by equality
+            after = functools.reduce(jnp.minimum, self.after_change(value))
+            near = after - value <= ROUNDING * jnp.finfo(value.dtype).eps * jnp.abs(value)
+            value = jnp.where(near, after, value)
         if self.lower is not None:
             value = jnp.maximum(value, self.lower)
         return jnp.where(self.fixed, self.fixed_value, value)
@@ -94,8 +98,10 @@ class Obstacles:
 
     def clipped(self, step: Field, value: Field) -> Field:
         """max(min(s, ψ − V), g − V) for a step s, and zero where V is fixed."""
-        if (ceiling := self.ceiling(value)) is not None:
-            step = jnp.minimum(step, ceiling - value)
+        if self.upper is not None:
+            step = jnp.minimum(step, self.upper - value)
+        if self.switching:  # to one step in the other mode, so that V_i = c_ij + V_j after it
+            step = self.after_changes(value + jnp.where(self.fixed, 0, step)) - value
         if self.lower is not None:
             step = jnp.maximum(step, self.lower - value)
         return jnp.where(self.fixed, 0, step)

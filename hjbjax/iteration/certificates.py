@@ -19,6 +19,7 @@ exact, and require float64.
 
 import dataclasses
 import enum
+import functools
 from typing import Any
 
 import jax
@@ -141,7 +142,7 @@ def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[
     zero = jnp.zeros((), value.dtype)
     if kind is Certificate.ADDITIVE:
         defect = jax.lax.optimization_barrier(defect)
-        error = on.grid.layout.largest(jnp.abs(given.clipped(defect / on.problem.discount, value)))
+        error = on.grid.layout.largest(jnp.abs(_shift(given, defect / on.problem.discount, value)))
         return given.clipped(defect / outflow, value), ErrorBound(-error, error, zero, error, error)
     step = given.clipped(jax.lax.optimization_barrier(defect / outflow), value)
     residual = on.grid.layout.largest(jnp.abs(step))
@@ -151,17 +152,25 @@ def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
     """The minimum and maximum of ρ = max(min(r/β, ψ − V), g − V)."""
     layout, value, policy, obstacles = iterate.layout, iterate.value, iterate.policy, iterate.obstacles
-    ceiling = obstacles.ceiling(value)
-    if ceiling is None and obstacles.lower is None:  # reductions first, without an array r/β
-        return layout.least(policy.defect) / discount, layout.largest(policy.defect) / discount
-    shift = policy.defect / discount
-    if ceiling is not None:
-        shift = jnp.minimum(shift, ceiling - value)
+    if obstacles.upper is None and obstacles.lower is None and not obstacles.switching:
+        return layout.least(policy.defect) / discount, layout.largest(policy.defect) / discount  # without an array r/β
+    shift = _shift(obstacles, policy.defect / discount, value)
+    return layout.least(shift), layout.largest(shift)
+
+
+def _shift(obstacles: Obstacles, shift: Field, value: Field) -> Field:
+    """max(min(r/β, ψ − V), g − V) from r/β, (*grid); zero at fixed nodes, where V is exact.
+
+    A change of the mode counts only where V_i = c_ij + V_j, since adding a constant to V does not reduce the rest.
+    """
+    if obstacles.switching:
+        after = functools.reduce(jnp.minimum, obstacles.after_change(value))
+        shift = jnp.where(value < after, shift, jnp.minimum(shift, after - value))
+    if obstacles.upper is not None:
+        shift = jnp.minimum(shift, obstacles.upper - value)
     if obstacles.lower is not None:
         shift = jnp.maximum(shift, obstacles.lower - value)
-    # at fixed nodes V is exact; r is zero there, but ψ − V and g − V may differ from zero
-    shift = jnp.where(obstacles.fixed, 0, shift)
-    return layout.least(shift), layout.largest(shift)
+    return jnp.where(obstacles.fixed, 0, shift)
 
 
 def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> ErrorBound:

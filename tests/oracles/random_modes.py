@@ -58,7 +58,7 @@ def problem(one, *, noise=True, rates=True, steered=False, switching=True, **oth
         lambda x, u, mode: a[mode] @ x + b[mode] * u[0],
         lambda x, u, mode: weight[mode] * jnp.sum((x - centre[mode]) ** 2) + 0.1 * u[0] ** 2,
         hjb.Finite(one.actions[:, None]),
-        noise=(lambda x, u, mode: spread[mode]) if noise else None,
+        noise=(lambda x, u, mode: spread[mode] + 0 * x) if noise else None,
         modes=modes,
         **({"discount": one.discount} | others),
     )

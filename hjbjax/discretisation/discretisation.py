@@ -323,10 +323,9 @@ class Discretisation:
         found: list[Any] = [True] * self.grid.ndim
         for u, d in self._probes():
             f, a = self.drift(u, d, x), self.diffusion(u, d, x)
-            for axis, link in enumerate(links):
-                left = stencil.noise_along(a, self.grid, axis)
-                if axis in self.grid.state_axes:
-                    found[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
+            for axis in self.grid.state_axes:
+                left, link = stencil.noise_along(a, self.grid, axis), links[axis]
+                found[axis] &= left >= jnp.maximum(link.up, link.down) * jnp.abs(f[axis])
         return found
 
     def _probes(self) -> list[tuple[list, list]]:

@@ -166,9 +166,8 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     inputs = found.control if sign > 0 else found.disturbance
     driven = tuple(drift.driven_by([j]) for j in inputs)
     curved = tuple(cost.has_square([j]) for j in inputs)
-    affine = (
-        drift.affine_in(inputs) and found.switching.affine_in(inputs) and noise.free_of(inputs)
-    )  # then the rate of leaving a node is convex
+    # then the rate of leaving a node is convex
+    affine = drift.affine_in(inputs) and found.switching.affine_in(inputs) and noise.free_of(inputs)
     # without bounds there are no ends, and the fastest action is known only once it has been chosen
     at_ends = (affine and not getattr(admissible, "unbounded", False)) or isinstance(admissible, (Finite, type(None)))
     suits = affine and cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball))
@@ -189,19 +188,9 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     cells = tuple(branches ** len(shared(driven, group)) for group in groups)
     suits &= all(count <= PROGRAMS for count, program in zip(cells, programs, strict=True) if program)
     return Player(
-        admissible,
-        sign,
-        suits,
-        driven,
-        groups,
-        cells,
-        programs,
-        curved,
-        products,
-        at_ends,
-        _effort(found.operations),
+        admissible, sign, suits, driven, groups, cells, programs, curved, products, at_ends, _effort(found.operations),
         not found.switching.free_of(inputs),
-    )
+    )  # fmt: skip
 
 
 def _effort(needed: Operations) -> int:

@@ -56,6 +56,10 @@ class Obstacles:
         """The cost of changing the mode by 1, ..., k − 1 plus the value there, each (*grid)."""
         return [cost + jnp.roll(value, -k, 0) for k, cost in enumerate(self.switching, start=1)]
 
+    def least_after_change(self, value: Nodes) -> Field:
+        """min_j (c_ij + V_j), (*grid); only if the controller may change the mode."""
+        return functools.reduce(jnp.minimum, self.after_change(value))
+
     def ceiling(self, value: Nodes) -> Field | None:
         """The bound that stopping and a change of the mode put on V: min(ψ, c_ij + V_j); None without either."""
         bounds = [*([] if self.upper is None else [self.upper]), *self.after_change(value)]
@@ -69,7 +73,7 @@ class Obstacles:
         if self.switching:
             value = self.after_changes(jnp.where(self.fixed, self.fixed_value, value))
             # the certificate distinguishes nodes where the mode is changed by equality
-            after = functools.reduce(jnp.minimum, self.after_change(value))
+            after = self.least_after_change(value)
             near = after - value <= ROUNDING * jnp.finfo(value.dtype).eps * jnp.abs(value)
             value = jnp.where(near, after, value)
         if self.lower is not None:
@@ -79,7 +83,7 @@ class Obstacles:
     def after_changes(self, value: Field) -> Field:
         """The least of ``value`` and of its values in other modes plus the costs of changing to them, (*grid)."""
         for _ in self.switching:  # a cheapest path of changes has at most k − 1 of them
-            value = functools.reduce(jnp.minimum, self.after_change(value), value)
+            value = jnp.minimum(value, self.least_after_change(value))
         return value
 
     def changes(self, value: Field) -> list[jax.Array]:

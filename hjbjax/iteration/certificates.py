@@ -19,7 +19,6 @@ exact, and require float64.
 
 import dataclasses
 import enum
-import functools
 from typing import Any
 
 import jax
@@ -164,7 +163,7 @@ def _shift(obstacles: Obstacles, shift: Field, value: Field) -> Field:
     A change of the mode counts only where V_i = c_ij + V_j, since adding a constant to V does not reduce the rest.
     """
     if obstacles.switching:
-        after = functools.reduce(jnp.minimum, obstacles.after_change(value))
+        after = obstacles.least_after_change(value)
         shift = jnp.where(value < after, shift, jnp.minimum(shift, after - value))
     if obstacles.upper is not None:
         shift = jnp.minimum(shift, obstacles.upper - value)

@@ -15,29 +15,17 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.modes import Modes
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import PAYMENTS, Problem
 from hjbjax.problem.pytree import REMEMBERED, altered, as_partial, is_traced
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, Number
 
-OF_ACTION, OF_STATE = (
-    ("drift", "cost", "noise"),
-    ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max"),
-)
+OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max")
 
 
 def in_mode(problem: Problem, mode: int) -> Problem:
     """The problem in one mode, without changes of the mode."""
-    names = (
-        *OF_ACTION,
-        *OF_STATE,
-        "reward",
-        "exit_reward",
-        "terminal_reward",
-        "stopping_reward",
-        "discount",
-        "controls",
-    )
+    names = ("drift", "cost", "noise", *OF_STATE, *PAYMENTS, "discount", "controls")
     fixed = {name: _in_mode(each, mode) for name in names if callable(each := getattr(problem, name))}
     return altered(problem, modes=None, **fixed)
 

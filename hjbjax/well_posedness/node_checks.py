@@ -82,7 +82,7 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
 def _check_round_trips(costs: np.ndarray, grid: Grid) -> None:
     """Refuse costs of changing the mode, (k − 1, *grid), that are not numbers ≥ 0, and round trips that cost nothing.
 
-    At no cost the controller could change the mode for ever.
+    At no cost the controller could change the mode without end.
     """
     count = len(costs) + 1
     # least[d] is the cheapest way from mode i to mode i + d by the changes so far; d = 0 is a round trip
@@ -99,7 +99,7 @@ def _check_round_trips(costs: np.ndarray, grid: Grid) -> None:
         raise ValueError(
             f"Modes.switching_cost: a cost is negative or NaN, or a round trip of changes costs nothing, {where}.\n"
             "Wanted costs ≥ 0, infinity to forbid a change, and more than zero for every round trip: otherwise the "
-            "controller would change the mode for ever"
+            "controller would change the mode without end"
         )
 
 

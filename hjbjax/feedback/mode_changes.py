@@ -1,11 +1,13 @@
 """Changes of the mode along a path, at random and by choice.
 
-The state of the loop is (i, x, s): the mode, the state, and a clock with
+The state of the loop is (i, x, s, n): the mode, the state, a clock with
 
     ds = −Σ_j λ_ij(x, u, d) dt
 
-that starts from a draw of the exponential law with mean one. When it reaches zero, the mode changes to j with
-probability λ_ij/Σ_j λ_ij, and the clock starts again. This is the law of the changes, without an error of the steps.
+that starts from a draw of the exponential law with mean one, and the number of random changes so far. When the clock
+reaches zero, the mode changes to j with probability λ_ij/Σ_j λ_ij, and the clock starts again. This is the law of the
+changes, without an error of the steps. The n-th change has the n-th draw of the key, so that rounding errors in the
+time of a change do not alter the later changes.
 The controller changes the mode where V_i = c_ij + V_j at every surrounding node, and pays c_ij.
 """
 
@@ -32,26 +34,28 @@ STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "target", "switchi
 
 @pytree_dataclass(static=("name",))
 class Clocked:
-    """A function of a problem whose state begins with the mode, as a function of the state with a clock."""
+    """A function of a problem whose state begins with the mode, as a function of the state with clock and count."""
 
     problem: Problem
     name: str
 
     def __call__(self, *arguments: Any) -> Array:
-        """The value at the problem's arguments, with (i, x, s) instead of (i, x)."""
+        """The value at the problem's arguments, with (i, x, s, n) instead of (i, x)."""
         problem, place = self.problem, int(self.problem.time_dependent)
-        z = arguments[place][:-1]
+        z = arguments[place][:-2]
         own = (*arguments[:place], z, *arguments[place + 1 :])
         if self.name == "noise":
             t = own[0] if place else 0.0
             sigma = problem.diffusion(z, own[place + 1], own[place + 2] if problem.is_game else None, t)
-            return jnp.pad(sigma, ((0, 1), (0, 0)))
+            return jnp.pad(sigma, ((0, 2), (0, 0)))
         ingredient = getattr(problem, self.name)
         found = ingredient(*own) if callable(ingredient) else ingredient
         if self.name != "drift":
             return found
         leaving = 0.0 if problem.mode_rates is None else jnp.sum(problem.mode_rates(*own))
-        return jnp.append(jnp.asarray(found, z.dtype), jnp.asarray(-leaving, z.dtype))
+        return jnp.append(
+            jnp.asarray(found, z.dtype), jnp.stack([jnp.asarray(-leaving, z.dtype), jnp.zeros((), z.dtype)])
+        )
 
 
 def refuse_mode(modes: Modes | None, mode: object, name: str) -> None:
@@ -85,7 +89,7 @@ def grid_of_modes(grid: Grid | None, modes: Modes | None) -> Grid | None:
 
 
 def with_clock(loop: Loop, x0: Any, key: Key | None, count: int) -> tuple[Loop, Any]:
-    """The loop and its start with the clock appended to the state; unchanged without modes.
+    """The loop and its start with clock and count appended to the state; unchanged without modes.
 
     Args:
       loop: the loop of a problem whose state begins with the mode.
@@ -102,20 +106,19 @@ def with_clock(loop: Loop, x0: Any, key: Key | None, count: int) -> tuple[Loop, 
     if callable(problem.noise):
         changed["noise"] = as_partial(Clocked(problem, "noise"))
     elif problem.noise is not None:
-        changed["noise"] = jnp.pad(problem.diffusion(jnp.zeros(np.shape(x0)), jnp.zeros(0)), ((0, 1), (0, 0)))
-    first = jnp.ones((), x0.dtype) if problem.mode_rates is None else draws(key, jnp.zeros((), x0.dtype))[1]
-    longer, start = with_entry(loop, altered(problem, **changed), x0, first)
+        changed["noise"] = jnp.pad(problem.diffusion(jnp.zeros(np.shape(x0)), jnp.zeros(0)), ((0, 2), (0, 0)))
+    none = jnp.zeros((), x0.dtype)
+    longer, start = loop, x0
+    for first in (jnp.ones((), x0.dtype) if problem.mode_rates is None else draws(key, none)[1], none):
+        longer, start = with_entry(longer, altered(problem, **changed), start, first)
     return dataclasses.replace(longer, modes=count, clock=len(x0), key=key), start
 
 
-def draws(key: Key | None, t: jax.Array) -> tuple[Array, Array]:
-    """A uniform number, and a number of the exponential law with mean one, for the change at the time t."""
+def draws(key: Key | None, n: jax.Array) -> tuple[Array, Array]:
+    """A uniform number, and a number of the exponential law with mean one, for the n-th change."""
     assert key is not None  # a problem with random changes has a key
-    key = jax.random.fold_in(key, STREAM)
-    for word in jnp.atleast_1d(jax.lax.bitcast_convert_type(t, np.uint32)):  # one for float32, two for float64
-        key = jax.random.fold_in(key, word)
-    which, when = jax.random.split(key)
-    return jax.random.uniform(which, (), t.dtype), jax.random.exponential(when, (), t.dtype)
+    which, when = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, STREAM), n.astype(np.uint32)))
+    return jax.random.uniform(which, (), n.dtype), jax.random.exponential(when, (), n.dtype)
 
 
 def after_changes(loop: Loop, t: jax.Array, y: jax.Array, start: Number) -> jax.Array:
@@ -131,9 +134,11 @@ def after_changes(loop: Loop, t: jax.Array, y: jax.Array, start: Number) -> jax.
     if problem.mode_rates is not None:
         rates = problem.mode_rates(*problem.arguments(loop.wrap(x), *loop.players(t, x), t))
         edges = jnp.cumsum(jnp.maximum(jnp.asarray(rates, x.dtype), 0))
-        which, clock = draws(loop.key, t)
+        count = x[loop.clock + 1] + 1
+        which, clock = draws(loop.key, count)
         number = 1 + jnp.minimum(jnp.searchsorted(edges, which * edges[-1], side="right"), len(edges) - 1)
-        x = jnp.where(x[loop.clock] <= 0, _in_mode(loop, x, number).at[loop.clock].set(clock), x)
+        changed = _in_mode(loop, x, number).at[loop.clock : loop.clock + 2].set(jnp.stack([clock, count]))
+        x = jnp.where(x[loop.clock] <= 0, changed, x)
     if loop.switch is not None:
         for _ in range(loop.modes - 1):  # a cheapest path of changes has at most k − 1 of them
             surplus = loop.switch(t, loop.wrap(x))
@@ -183,8 +188,8 @@ def _costs_at_nodes(problem: Problem, grid: Grid, dtype: Any, times: Any) -> lis
 
 
 def without_clock(path: Path, count: int) -> Path:
-    """The path without the clock; its states begin with the mode."""
-    return dataclasses.replace(path, states=path.states[:, :-1]) if count else path
+    """The path without clock and count; its states begin with the mode."""
+    return dataclasses.replace(path, states=path.states[:, :-2]) if count else path
 
 
 def with_modes_apart(path: Path, count: int) -> Path:

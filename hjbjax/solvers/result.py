@@ -387,9 +387,10 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     if code is Status.STALLED and np.isfinite(best) and certified:
         return within_reach(best)
     if code is Status.STALLED and np.isfinite(best):
+        wider = "" if jnp.finfo(state.value.dtype).bits == 64 else ", or compute in float64"
         return (
             f"Residual and last step stopped decreasing at {best:.2g}, above the tolerance, and no certificate bounds "
-            "the error; add a discount, some noise or a better guess, or compute in float64."
+            f"the error; add a discount, some noise or a better guess, increase tol{wider}."
         )
     if code is Status.CONVERGED and task.certificate is Certificate.NONE and task.constrained:
         return "The value no longer changes, up to rounding; no certificate bounds the error."

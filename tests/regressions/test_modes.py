@@ -325,6 +325,16 @@ def test_random_changes_have_their_law():
     assert abs(np.mean(costs) - total) < 4 * np.std(costs) / np.sqrt(2000)
 
 
+def test_rounding_of_a_time_of_change_does_not_alter_the_later_changes():
+    def modes(rate):
+        chances = hjb.Modes(("a", "b", "c"), rates=rate * (1 - np.eye(3)))
+        problem = hjb.Problem(lambda x, u, mode: 0 * x, modes=chances)
+        return hjb.simulate(problem, None, [0.0], 9.0, mode="a", key=3).modes
+
+    assert np.array_equal(modes(1.0), modes(1.0 + 1e-6))
+    assert len(set(modes(1.0))) == 3
+
+
 def mean_cost(problem, found, start, seed):
     """The mean cost of 400 paths and three standard errors."""
     times = jnp.linspace(0.0, 12.0, 61)

@@ -387,7 +387,7 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     if code is Status.STALLED and np.isfinite(best) and certified:
         return within_reach(best)
     if code is Status.STALLED and np.isfinite(best):
-        wider = "" if jnp.finfo(state.value.dtype).bits == 64 else ", or compute in float64"
+        wider = "" if np.asarray(state.progress.best).itemsize == 8 else ", or compute in float64"
         return (
             f"Residual and last step stopped decreasing at {best:.2g}, above the tolerance, and no certificate bounds "
             f"the error; add a discount, some noise or a better guess, increase tol{wider}."

@@ -25,6 +25,7 @@ from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
 from hjbjax.markov_chain import chain
 from hjbjax.problem.ends import Dirichlet, Neumann, Robin
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.jumps import Jump
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
@@ -59,6 +60,7 @@ __all__ = [
     "FreeTime",
     "Grid",
     "Implicit",
+    "Jump",
     "Krylov",
     "Limited",
     "Modes",

@@ -21,6 +21,7 @@ from hjbjax.problem.pytree import altered, as_partial, is_traced, pytree_datacla
 from hjbjax.problem.types import Array, Control, Disturbance, Number, State
 
 T = TypeVar("T", bound=Callable | None)
+OF_CHANGES = ("mode_rates", "intensities", "landings")  # the functions of sudden changes, of the mode and of the state
 
 
 @pytree_dataclass(static=("marched", "timed"))
@@ -56,6 +57,16 @@ class ClosedLoop:
         """The rates of changes of the mode, shape (k − 1,)."""
         t, x, u, d, acts = self._actions(arguments)
         return jnp.where(acts, jnp.asarray(self.problem.mode_rates(*self.problem.arguments(x, u, d, t))), 0)
+
+    def intensities(self, *arguments: Array) -> jax.Array:
+        """The rates of the jumps of the state, shape (k,)."""
+        t, x, u, d, acts = self._actions(arguments)
+        return jnp.where(acts, jnp.asarray(self.problem.intensities(*self.problem.arguments(x, u, d, t))), 0)
+
+    def landings(self, *arguments: Array) -> jax.Array:
+        """The states after the jumps, shape (k, n)."""
+        t, x, u, d, _ = self._actions(arguments)
+        return jnp.asarray(self.problem.landings(*self.problem.arguments(x, u, d, t)))
 
     def _actions(self, arguments: tuple[Array, ...]) -> tuple[Number, State, Control, Disturbance | None, jax.Array]:
         """The time, the state, the control, the disturbance, and True if there is a control."""
@@ -107,7 +118,8 @@ def close_loop(problem: Problem, feedback: GridFeedback | Callable, horizon: Num
         isaacs=problem.isaacs,
         time_dependent=loop.timed,
     )  # fmt: skip
-    return closed if problem.mode_rates is None else altered(closed, mode_rates=as_partial(loop.mode_rates))
+    random = [name for name in OF_CHANGES if getattr(problem, name) is not None]
+    return altered(closed, **{name: as_partial(getattr(loop, name)) for name in random})
 
 
 def exit_problem(
@@ -131,7 +143,7 @@ def exit_problem(
         disturbances=problem.disturbances, noise=problem.noise, target=jax.tree_util.Partial(_nearest, sets),
         exit_cost=paid, isaacs=problem.isaacs, time_dependent=problem.time_dependent,
     )  # fmt: skip
-    return altered(question, mode_rates=problem.mode_rates)
+    return altered(question, **{name: getattr(problem, name) for name in OF_CHANGES})
 
 
 def arrival(problem: Problem, target: Callable, obstacle: Callable | None) -> Problem:

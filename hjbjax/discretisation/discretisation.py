@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import cut_cells, stencil
+from hjbjax.discretisation.landing import Corners, corners
 from hjbjax.discretisation.paths import Paths
 from hjbjax.discretisation.players import Players, find_players
 from hjbjax.discretisation.stencil import Links
@@ -282,6 +283,18 @@ class Discretisation:
         """The rates of jumps over 1, ..., k − 1 modes; empty without random changes of the mode."""
         rates = self.problem.mode_rates
         return [] if rates is None else list(components.components(rates, *self._arguments(u, d, x), dtype=self.dtype))
+
+    def intensities(self, u: list, d: list | None = None, x: list | None = None) -> list:
+        """The rates of the jumps of the state; empty without jumps."""
+        rates = self.problem.intensities
+        return [] if rates is None else list(components.components(rates, *self._arguments(u, d, x), dtype=self.dtype))
+
+    def landings(self, u: list, d: list | None = None, x: list | None = None) -> list[Corners]:
+        """The corners between which each jump of the state lands; empty without jumps."""
+        if self.problem.landings is None:
+            return []
+        found = components.components(self.problem.landings, *self._arguments(u, d, x), dtype=self.dtype)
+        return [corners(self.grid, list(y), self.dtype) for y in found]
 
     def switching_costs(self) -> list:
         """The costs of changing the mode by 1, ..., k − 1, each (*grid); empty if the controller cannot change it."""

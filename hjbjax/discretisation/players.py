@@ -57,7 +57,8 @@ class Player:
       products: the pairs of inputs, the smaller index first, whose product the cost may contain.
       fastest_at_ends: True if the largest rate of leaving a node is attained at the ends of the set.
       effort: the weight of one evaluation of H when deciding what to write out.
-      switches: True if the rates of changes of the mode depend on its inputs.
+      switches: True if the rates of jumps, including changes of the mode, depend on its inputs.
+      lands: True if the states after jumps depend on its inputs.
     """
 
     admissible: AdmissibleSet | None
@@ -72,6 +73,7 @@ class Player:
     fastest_at_ends: bool
     effort: int
     switches: bool = False
+    lands: bool = False
 
     def derivative(self, problem: Problem, function: Callable, j: int) -> Callable:
         """∂/∂u_j of a function of the problem's arguments, as a function of one state without unneeded axes."""
@@ -170,7 +172,8 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     affine = drift.affine_in(inputs) and found.switching.affine_in(inputs) and noise.free_of(inputs)
     # without bounds there are no ends, and the fastest action is known only once it has been chosen
     at_ends = (affine and not getattr(admissible, "unbounded", False)) or isinstance(admissible, (Finite, type(None)))
-    suits = affine and cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball))
+    suits = affine and found.landing.free_of(inputs)
+    suits &= cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball))
     products = frozenset(tuple(j - inputs.start for j in pair) for pair in cost.products_in(inputs))
     groups = _groups(driven, products)
     if isinstance(admissible, Ball):
@@ -189,7 +192,7 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     suits &= all(count <= PROGRAMS for count, program in zip(cells, programs, strict=True) if program)
     return Player(
         admissible, sign, suits, driven, groups, cells, programs, curved, products, at_ends, _effort(found.operations),
-        not found.switching.free_of(inputs),
+        not found.switching.free_of(inputs), not found.landing.free_of(inputs),
     )  # fmt: skip
 
 

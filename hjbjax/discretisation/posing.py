@@ -17,6 +17,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem.arguments import with_calls_by_name
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.jump_terms import with_jump_functions, with_mean_jump_costs
 from hjbjax.problem.mode_axis import in_mode, of_mode, over_modes, with_modes, without_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, cast, is_traced
@@ -62,7 +63,7 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
             return function(**given)
         if isinstance(grid, Grid):
             n = without_modes(grid).ndim
-            joined = [over_checked_modes(costs_of(each), n) if _has_modes(each) else each for each in problems]
+            joined = [_for_solvers(each, n) if _jumps_or_has_modes(each) else each for each in problems]
             given[second] = grid = _grid_of_all(grid, problems, name)
             made = [posed(each, grid) if _needs_posing(each) else each for each in joined]
             given[first] = made[0] if isinstance(asked, Problem) else made
@@ -81,6 +82,8 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
 def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorator of a public function of (problem, grid, ...): a problem with modes gets the mode as its first state.
 
+    Jumps of the state become functions of all arguments.
+
     The function also receives the grid with an axis of modes. Problems without modes pass through unchanged.
 
     Args:
@@ -92,8 +95,9 @@ def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]
 
         def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
             problem, grid = given[first], given[second]
-            if _has_modes(problem) and isinstance(grid, Grid):
-                given[first] = over_checked_modes(costs_of(problem), without_modes(grid).ndim)
+            if _jumps_or_has_modes(problem) and isinstance(grid, Grid):
+                given[first] = _for_solvers(problem, without_modes(grid).ndim)
+            if _jumps_or_has_modes(problem) and problem.modes is not None and isinstance(grid, Grid):
                 given[second] = with_modes(grid, problem.modes.names)
                 given |= {name: of_mode(given[name], problem.modes) for name in of_state if name in given}
             return function(**given)
@@ -104,15 +108,20 @@ def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]
 
 
 def _needs_posing(problem: object) -> bool:
-    """True for a problem with modes, or whose bounds or discount are functions of the state."""
+    """True for a problem with modes or jumps, or whose bounds or discount are functions of the state."""
     if not isinstance(problem, Problem):
         return False
-    return _has_modes(problem) or callable(problem.discount) or callable(problem.controls)
+    return _jumps_or_has_modes(problem) or callable(problem.discount) or callable(problem.controls)
 
 
-def _has_modes(problem: object) -> bool:
-    """True for a problem with modes."""
-    return isinstance(problem, Problem) and problem.modes is not None
+def _jumps_or_has_modes(problem: object) -> bool:
+    """True for a problem with modes, or with jumps of the state."""
+    return isinstance(problem, Problem) and (problem.modes is not None or bool(problem.jumps))
+
+
+def _for_solvers(problem: Problem, n: int) -> Problem:
+    """The problem with costs, the mode as its first state, and the mean costs of its jumps in the running cost."""
+    return with_mean_jump_costs(over_checked_modes(costs_of(problem), n))
 
 
 def _grid_of_all(grid: Grid, problems: list[Problem], name: str) -> Grid:
@@ -243,18 +252,22 @@ def _least(on: Discretisation) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def over_checked_modes(problem: Problem, n: int) -> Problem:
-    """The problem whose state begins with the mode, after checks of its functions in every mode on one state.
+    """The problem whose state begins with the mode, and whose jumps are functions of all its arguments.
+
+    The functions are checked in every mode on one state.
 
     Raises:
-      ValueError: a function of the wrong shape in some mode.
+      ValueError: a function of the wrong shape, in some mode.
     """
     modes = problem.modes
     if modes is None:
-        return problem
+        checks.jumps_of_one_state(with_any_control(problem, n), n)
+        return with_jump_functions(problem)
     for number, name in enumerate(modes.names):
         try:
             one = with_any_control(in_mode(problem, number), n)
-            checks.of_one_state(one, n, "the number of axes of the grid")
+            checks.jumps_of_one_state(one, n)
+            checks.of_one_state(altered(one, jumps=()), n, "the number of axes of the grid")
         except ValueError as error:
             raise ValueError(f"in mode {name!r}: {error}") from error
     sizes = {
@@ -267,4 +280,4 @@ def over_checked_modes(problem: Problem, n: int) -> Problem:
         if callable(table := getattr(modes, name)):
             shapes = {letter: sizes.get(letter, ()) for letter in names}
             checks.function_of(table, f"Modes.{name}: {name}", (len(modes.names),) * 2, **shapes)
-    return over_modes(problem, n)
+    return over_modes(with_jump_functions(problem), n)

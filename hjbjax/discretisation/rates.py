@@ -23,9 +23,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hjbjax.discretisation import schemes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.landing import Landing
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass, tie
@@ -42,26 +44,38 @@ class Rates:
       offsets: the jumps o, each a tuple of −1, 0, 1, one entry per axis; along an axis of modes up to k − 1.
       values: for each offset the rates c_o ≥ 0 per unit time, shape (*grid); none leads out of the box.
       one_way: True if at most one of two opposite jumps has a positive rate, as without noise.
+      landings: the jumps to other nodes than neighbours, with their rates.
     """
 
     offsets: tuple[Offset, ...]
     values: tuple[Any, ...]
     one_way: bool = False
+    landings: tuple[Landing, ...] = ()
 
     def total(self) -> Any:
         """Q = Σ_o c_o, the rate at which the chain leaves each node, shape (*grid)."""
-        return sum(self.values[1:], start=self.values[0])  # start=0 would cost one more array
+        first, *others = (*self.values, *(landing.rate for landing in self.landings))
+        return sum(others, start=first)  # start=0 would cost one more array
 
     def apply(self, grid: Grid, values: jax.Array) -> jax.Array:
         """𝓛V for node values V, shape (*grid); cost per unit time."""
         jumps = zip(self.offsets, self.values, strict=True)
         # differences first: c V(x + o) and c V(x) are both large for small h, while their difference is not
         terms = [c * (stencil.continued(values, grid, offset) - values) for offset, c in jumps]
+        terms += [landing.rate * (landing.ahead(values) - values) for landing in self.landings]
         return sum(terms[1:], start=terms[0])
 
     def scaled(self, factor: Any) -> "Rates":
         """Every rate times ``factor``, shape (*grid) or a number."""
-        return dataclasses.replace(self, values=tuple(factor * c for c in self.values))
+        values, landings = (factor * c for c in self.values), (each.weighed(factor) for each in self.landings)
+        return dataclasses.replace(self, values=tuple(values), landings=tuple(landings))
+
+    def kept(self, mask: Any) -> "Rates":
+        """The rates where ``mask`` is true, bool (*grid), and zero elsewhere, also instead of NaN; on the host too."""
+        xp: Any = np if isinstance(self.values[0], np.ndarray) and isinstance(mask, np.ndarray) else jnp
+        values = (xp.where(mask, c, 0) for c in self.values)
+        landings = (dataclasses.replace(each, rate=xp.where(mask, each.rate, 0)) for each in self.landings)
+        return dataclasses.replace(self, values=tuple(values), landings=tuple(landings))
 
     def inflow(self, grid: Grid) -> "Rates":
         """The off-diagonal part of the transposed generator, as rates from x + o into x."""
@@ -69,7 +83,7 @@ class Rates:
         arriving = [
             stencil.neighbour(c, grid, offset, ghost=False) for offset, c in zip(opposite, self.values, strict=True)
         ]
-        return Rates(tuple(opposite), tuple(arriving))
+        return Rates(tuple(opposite), tuple(arriving), landings=tuple(each.reversed() for each in self.landings))
 
 
 def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
@@ -90,7 +104,13 @@ def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
     for number, rate in enumerate(on.mode_rates(u, d, x), start=1):
         table[stencil.unit(grid, 0, number)] = rate
     values = tuple(jnp.broadcast_to(jnp.asarray(rate, on.dtype), grid.shape) for rate in table.values())
-    return Rates(tuple(table), values, one_way=on.problem.noise is None and on.scheme.chain.one_way and not others)
+    landings = tuple(
+        Landing(nodes, rate * weight)
+        for rate, found in zip(on.intensities(u, d, x), on.landings(u, d, x), strict=True)
+        for nodes, weight in zip(found.nodes, found.weights, strict=True)
+    )
+    one_way = on.problem.noise is None and on.scheme.chain.one_way and not others
+    return Rates(tuple(table), values, one_way, landings)
 
 
 def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[Offset, Any]:
@@ -137,7 +157,8 @@ def fastest_rate(on: Discretisation) -> jax.Array:
         mine = (_table(on, on.drifts(u, ds[0])[0], on.diffusion(u, ds[0])) for u in us)
         theirs = (_table(on, on.drifts(us[0], d)[1], {}) for d in ds)
         tables = ([sum(table.values()) for table in each] for each in (mine, theirs))
-        switching = [sum(on.mode_rates(u, d), start=result) for u, d in itertools.product(us, ds)]
+        pairs = itertools.product(us, ds)
+        switching = [sum([*on.mode_rates(u, d), *on.intensities(u, d)], start=result) for u, d in pairs]
         return functools.reduce(jnp.maximum, switching) + sum(functools.reduce(jnp.maximum, each) for each in tables)
     for u, d in itertools.product(us, ds):
         result = jnp.maximum(result, jump_rates(on, u, d).total())

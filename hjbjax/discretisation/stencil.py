@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.discretisation.landing import Landing
 from hjbjax.problem.grid import CONTINUED, Grid, undivided
 from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.problem.types import Array, AtNodes, Field, Number
@@ -346,11 +347,13 @@ def neighbour_numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:
 
 
 def sparse(
-    offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid
-) -> "csr_array":
+    offsets: Sequence[tuple[int, ...]], values: Sequence[np.ndarray], diagonal: np.ndarray, grid: Grid,
+    landings: Sequence[Landing] = (),
+) -> "csr_array":  # fmt: skip
     """The matrix with ``diagonal`` and, for every offset o, the entry values_o(x) in row x and column x + o.
 
-    Host level. Nodes are indexed in C order. Entries whose column is outside the box must be zero.
+    Every landing has its rate in row x and column y(x). Host level. Nodes are indexed in C order. Entries whose column
+    is outside the box must be zero.
 
     Returns:
       A SciPy CSR array of shape (nodes, nodes) without explicit zeros off the diagonal.
@@ -364,6 +367,12 @@ def sparse(
         rows.append(number[nonzero])
         columns.append(neighbour_numbers(grid, offset).ravel()[nonzero])
         entries.append(np.asarray(value, np.float64).ravel()[nonzero])
+    for landing in landings:
+        ends = (number, np.asarray(landing.nodes).ravel())
+        row, column = ends[::-1] if landing.transposed else ends
+        rows.append(row)
+        columns.append(column)
+        entries.append(np.broadcast_to(np.asarray(landing.rate, np.float64), grid.shape).ravel())
     index = (np.concatenate(rows), np.concatenate(columns))
     # coinciding entries add up, as for two jumps over the seam of an axis with two nodes
     return coo_array((np.concatenate(entries), index), shape=(grid.size, grid.size)).tocsr()

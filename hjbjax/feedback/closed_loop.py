@@ -30,9 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, are_finite, bridging, meeting_flag, onto_edge
-from hjbjax.feedback.mode_changes import after_changes
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.payments import is_tube
+from hjbjax.feedback.sudden_changes import after_changes
 from hjbjax.hamiltonian.derivatives import with_both_modes
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, State
@@ -104,9 +104,9 @@ def integrate(ivp: InitialValueProblem, stepping: Stepping) -> tuple[Path, jax.A
 
 def _integrated(given: tuple[InitialValueProblem, Stepping], reverse: bool) -> tuple[Path, jax.Array]:
     """The path of full length and its mask, computed by a program for forward or for reverse mode."""
-    if reverse and given[0].loop.modes:
+    if reverse and given[0].loop.clock:
         raise ValueError(
-            "simulate: a path with changes of the mode has no derivative in reverse mode, as the number of changes is "
+            "simulate: a path with jumps or changes of the mode has no derivative in reverse mode, as their number is "
             "not known beforehand; use forward mode, such as jax.jvp or jax.jacfwd"
         )
     interval, first = _intervals(*given, reverse)
@@ -187,7 +187,7 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
     if is_tube(loop.problem):
         extremes = _extremes(loop, start, (start[None], x0[None]), extremes)
     y = jnp.append(x0, 0.0)
-    y = after_changes(loop, start, y, start) if loop.modes else y
+    y = after_changes(loop, start, y, start) if loop.clock else y
     return interval, (start, y, code, jnp.zeros((), jnp.int32), extremes)
 
 
@@ -221,7 +221,7 @@ def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: R
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count, extremes), (later, states, controls, disturbances, active) = last, shown
     hit, ended = code == PathStatus.TARGET, code == PathStatus.DURATION
-    if loop.modes:  # the mode may change at once
+    if loop.clock:  # the mode may change at once
         x0 = after_changes(loop, start, jnp.append(x0, 0.0), start)[:-1]
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
     # a path that leaves the box or fails pays nothing at its end
@@ -248,7 +248,7 @@ def _through_changes(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
     """``_advance`` through all changes of the mode in an interval; the first of the ``times`` is that of the path."""
     start, t, end, last = times
-    if not loop.modes:
+    if not loop.clock:
         return _advance(loop, stepping, solve, (t, end, last), y, u)
 
     def on(carry: tuple) -> tuple:
@@ -257,8 +257,13 @@ def _through_changes(
         begun, at = jnp.where(again, carry[0], t), jnp.where(again, carry[1], y)
         now = u if stepping.held else loop.players(begun, at[:-1])[0]
         later, moved, code, more, seen = _advance(loop, stepping, solve, (begun, end, last), at, now)
-        moved = jnp.where(code == CHANGE, after_changes(loop, later, moved, start), moved)
-        code = jnp.where((code == CHANGE) & (later >= end), PathStatus.DURATION, code)
+        changed = code == CHANGE
+        moved = jnp.where(changed, after_changes(loop, later, moved, start), moved)
+        # a jump may lead into the target or out of the box
+        ended, outside = loop.target(later, moved[:-1]) <= 0, loop.margin(moved[:-1]) <= 0
+        code = jnp.where(changed & (later >= end), PathStatus.DURATION, code)
+        code = jnp.where(changed & outside, PathStatus.LEFT_BOX, code)
+        code = jnp.where(changed & ended, PathStatus.TARGET, code)
         return later, moved, code.astype(jnp.int32), carry[3] + more, seen
 
     def changes(carry: tuple) -> jax.Array:
@@ -300,7 +305,7 @@ def _advance(
     target, margin = loop.target(later, y[:-1]), loop.margin(y[:-1])
     # the codes are written from the weakest reason to the strongest; each `where` overrides the earlier ones
     code = jnp.where(met | (target <= margin), PathStatus.TARGET, PathStatus.LEFT_BOX)
-    if loop.modes:
+    if loop.clock:
         first = loop.until_change(later, y[:-1]) <= jnp.minimum(target, margin)
         code = jnp.where(first & ~met, CHANGE, code)
     if loop.guarded and not stepping.held:
@@ -349,7 +354,7 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
 
     def margin(t: Number, y: Array, args: Beginning, **kwargs: object) -> jax.Array:
         inside = jnp.minimum(loop.target(t, y[:n]), loop.margin(y[:n]))
-        if loop.modes:
+        if loop.clock:
             inside = jnp.minimum(inside, loop.until_change(t, y[:n]))
         if loop.guarded and not stepping.held:  # under a hold the players are only evaluated at the samples
             inside = jnp.where(are_finite(loop.players(t, y[:n])), inside, jnp.minimum(inside, -1))
@@ -373,7 +378,7 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
         kind, controller = diffrax.SRA1 if additive else diffrax.Euler, diffrax.ConstantStepSize()
         solver = bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
     event = None
-    ends = loop.modes or loop.guarded or loop.ends or (loop.grid is not None and not loop.clamp)
+    ends = loop.clock or loop.guarded or loop.ends or (loop.grid is not None and not loop.clamp)
     if ends:  # an event doubles the compile time
         close = BRACKET * jnp.finfo(x0.dtype).eps
         # flip=True: the function falls through zero; "detect" would put a host callback into the compiled program

@@ -18,8 +18,8 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, pytree_dataclass
 from hjbjax.problem.types import Array, Number, State
 
-PAYMENTS = ("cost", "exit_cost", "terminal_cost", "stopping_cost", "switching_costs")
-UNPAID = ("target", "mode_rates")  # functions that are no payments
+PAYMENTS = ("cost", "exit_cost", "terminal_cost", "stopping_cost", "switching_costs", "jump_costs")
+UNPAID = ("target", "mode_rates", "intensities", "landings")  # functions that are no payments
 
 
 @pytree_dataclass(static=("name",))

@@ -54,8 +54,9 @@ class Loop:
       due: the payment after the last time: "terminal cost", "V at the horizon", or "nothing" for a shortened path.
       at_horizon: V at the horizon as a function of (t, x), if the problem does not define it.
       switch: min_j (c_ij + V_j) − V_i and its terms as a function of (t, x); None if V changes no mode.
-      modes: the number of modes; zero without modes. See ``mode_changes``.
-      clock: the position of the clock in the state, which is zero when the mode changes at random.
+      modes: the number of modes; zero without modes. See ``sudden_changes``.
+      clock: the position of the clock in the state, which is zero when the mode or the state changes at random. Zero
+        without sudden changes.
       key: the key of the random changes.
     """
 
@@ -159,9 +160,9 @@ class Loop:
         return level if self.surplus is None else jnp.minimum(level, self.surplus(t, self.wrap(x)))
 
     def until_change(self, t: Number, x: State) -> jax.Array:
-        """A function ≤ 0 where the mode changes; inf without modes."""
+        """A function ≤ 0 where the mode or the state changes suddenly; inf if neither does."""
         left = jnp.asarray(jnp.inf, x.dtype)
-        if self.modes and self.problem.mode_rates is not None:
+        if self.problem.mode_rates is not None or self.problem.intensities is not None:
             left = x[self.clock]
         return left if self.switch is None else jnp.minimum(left, self.switch(t, self.wrap(x))[0])
 

@@ -14,7 +14,9 @@ from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_rec
 from hjbjax.feedback.discounting import with_integral, without_integral
 from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop, check_shapes, noise_key, settled_loop, timeless
-from hjbjax.feedback.mode_changes import (
+from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
+from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon
+from hjbjax.feedback.sudden_changes import (
     grid_of_modes,
     switching_surplus,
     with_clock,
@@ -22,8 +24,6 @@ from hjbjax.feedback.mode_changes import (
     with_modes_apart,
     without_clock,
 )
-from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
-from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
@@ -163,7 +163,7 @@ def simulate(
         path, active = _in_chunks(begun, stepping, clock)
         path, active, grid, controls = jax.tree.map(np.asarray, (path, active, loop.grid, loop.problem.controls))
         path, weights = without_integral(path, problem)
-        path = without_clock(path, count)
+        path = without_clock(path, problem, count)
         path = dataclasses.replace(path, promised=_promised(problem, feedback, start), payoff=problem.payoff)
         path = truncate(path, int(np.sum(active)), max_steps, grid, controls, problem.noise is not None)
         broken = broken_promise(
@@ -308,19 +308,19 @@ def rollout(
         *with_integral(*with_clock(loop, start, key, count)), jnp.asarray(times, start.dtype), key
     )
     path, _ = without_integral(integrate(begun, stepping)[0], problem)
-    path = with_modes_apart(without_clock(path, count), count)
+    path = with_modes_apart(without_clock(path, problem, count), count)
     return dataclasses.replace(path, payoff=problem.payoff)
 
 
 def _over_modes(
     problem: Problem, feedback: Feedback, disturbance: Callable | None, grid: Grid | None, n: int
 ) -> tuple[Problem, Feedback, Callable | None, Grid | None]:
-    """Everything for a state that begins with the mode; unchanged without modes."""
+    """Everything for a state that begins with the mode, with the jumps as functions; unchanged without both."""
     modes = problem.modes
+    if (modes is not None or problem.jumps) and problem.running_max is not None:
+        raise ValueError("simulate: got running_max with modes or jumps; the cost of such a path is not computed")
     if modes is None:
-        return problem, feedback, disturbance, grid
-    if problem.running_max is not None:
-        raise ValueError("simulate: got running_max and modes; the cost of such a path is not computed")
+        return over_checked_modes(problem, n), feedback, disturbance, grid
     players = (of_mode(player, modes) for player in (feedback, disturbance))
     return over_checked_modes(problem, n), *players, grid_of_modes(grid, modes)
 

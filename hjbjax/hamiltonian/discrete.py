@@ -37,6 +37,7 @@ class DiscreteHamiltonian:
       up, down: the slopes used by the drift: D⁺ and D⁻, or the slopes of a scheme of higher order.
       links: the distances to the neighbours along every axis.
       gaps: the values of V after a change of the mode by 1, ..., k − 1, minus V; empty without random changes.
+      landed: the values of V after each jump of the state, minus V; None if the landings depend on an action.
       bends: D⁺ − D⁻ along every axis, used by the noise, with the mirror image across a wall.
       tried: an action of each player that is a candidate in addition to the samples. With the actions of the last step
         as candidates a sampled policy never gets worse.
@@ -54,6 +55,7 @@ class DiscreteHamiltonian:
     bends: tuple[jax.Array, ...]
     links: tuple[stencil.Links, ...]
     gaps: tuple[jax.Array, ...] = ()
+    landed: tuple[jax.Array, ...] | None = ()
     tried: tuple[Action, Action] | None = None
     slack: tuple[Any, ...] | None = None
     lost: tuple[tuple[Any, Any], ...] | None = None
@@ -113,6 +115,9 @@ class DiscreteHamiltonian:
                 total = total + self._diagonal(i, j, entry)
         for rate, gap in zip(self.on.mode_rates(u, d, self.x) if self.gaps else [], self.gaps, strict=True):
             total = total + rate * gap
+        landed = landed_gaps(self.on, self.value, u, d, self.x) if self.landed is None else self.landed
+        for rate, gap in zip(self.on.intensities(u, d, self.x) if landed else [], landed, strict=True):
+            total = total + rate * gap
         return jnp.broadcast_to(total, grid.shape)
 
     def _diagonal(self, i: int, j: int, entry: Any) -> Any:
@@ -132,6 +137,12 @@ class DiscreteHamiltonian:
         ) / scale
 
 
+def landed_gaps(on: Discretisation, value: jax.Array, u: Action, d: Action, x: list) -> tuple[jax.Array, ...]:
+    """V after each jump of the state, minus V, under these actions; (*grid) each."""
+    # stored, because XLA would otherwise gather the corners again wherever a gap is used
+    return jax.lax.optimization_barrier(tuple(found.interpolate(value) - value for found in on.landings(u, d, x)))
+
+
 def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
     """A Hamiltonian with slopes D⁺ = s_i and D⁻ = −s_i everywhere: H = L + Σ s_i |f_i| plus the noise terms.
 
@@ -141,7 +152,7 @@ def at_rest(on: Discretisation, slopes: jax.Array) -> DiscreteHamiltonian:
     hamiltonian = around(on, jnp.zeros(on.grid.shape, slopes.dtype))
     one = jnp.ones(on.grid.shape, slopes.dtype)
     ups, downs, bends = (tuple(sign * slope * one for slope in slopes) for sign in (1, -1, 2))
-    return dataclasses.replace(hamiltonian, up=ups, down=downs, bends=bends, gaps=())
+    return dataclasses.replace(hamiltonian, up=ups, down=downs, bends=bends, gaps=(), landed=())
 
 
 def around(
@@ -159,6 +170,7 @@ def around(
     bends = tuple(stencil.bends(*pair, grid, axis) for axis, pair in enumerate(differences))
     jumps = range(1, len(grid.modes)) if on.problem.mode_rates is not None else ()
     gaps = tuple(stencil.neighbour(value, grid, stencil.unit(grid, 0, number)) - value for number in jumps)
+    landed = _landed_without_action(on, value, x)
     slopes = on.scheme.slopes(Differences(on, x, value, links, differences, lost, first_order))
     if first_order is not None and not on.scheme.blends:
         choose = functools.partial(jnp.where, first_order)
@@ -172,4 +184,17 @@ def around(
     careful = lost is not None or grid.sides("constrained")
     slack = tuple(edges.slack(on)) if careful else None
     beside = None if lost is None else edges.beside(lost, grid)
-    return DiscreteHamiltonian(on, x, value, tuple(up), tuple(down), bends, links, gaps, slack=slack, lost=beside)
+    return DiscreteHamiltonian(
+        on, x, value, tuple(up), tuple(down), bends, links, gaps, landed, slack=slack, lost=beside
+    )
+
+
+def _landed_without_action(on: Discretisation, value: jax.Array, x: list) -> tuple[jax.Array, ...] | None:
+    """``landed_gaps`` if the landings do not depend on any action, otherwise None."""
+    if on.problem.landings is None:
+        return ()
+    players = on.players.both
+    if any(player.lands for player in players):
+        return None
+    u, d = ([jnp.zeros((), on.dtype)] * len(player.driven) for player in players)
+    return landed_gaps(on, value, u, d, x)

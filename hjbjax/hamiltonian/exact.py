@@ -108,11 +108,12 @@ def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> _
         for j in range(count)
     ]
     linear, quadratic = _cost_coefficients(on, player, arguments)
-    if hamiltonian.gaps and player.switches:  # the gain of a change of the mode is affine in the inputs, like its rate
-        for j in range(count):
-            rates = player.derivative(on.problem, on.problem.mode_rates, j)
-            found = components.components(rates, *arguments, dtype=on.dtype)
-            linear[j] = linear[j] + _dot(list(found), hamiltonian.gaps)
+    # the gain of a jump, or of a change of the mode, is affine in the inputs, like its rate
+    jumps = (on.problem.mode_rates, hamiltonian.gaps), (on.problem.intensities, hamiltonian.landed)
+    for rates, gaps in jumps if player.switches else ():
+        for j in range(count if gaps else 0):
+            found = components.components(player.derivative(on.problem, rates, j), *arguments, dtype=on.dtype)
+            linear[j] = linear[j] + _dot(list(found), gaps or ())
     return _Part(hamiltonian, player, linear, quadratic, parts[number], slopes, noise)
 
 

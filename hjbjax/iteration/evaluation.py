@@ -37,6 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
+from hjbjax.discretisation.landing import Landing
 from hjbjax.iteration import gauss_seidel
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem import arguments
@@ -109,7 +110,7 @@ class Sweeps(Evaluation):
     def solve(self, equation: PolicyEquation, grid: Grid) -> jax.Array:
         """Rounds of Gauss–Seidel in single precision."""
         # saves half the memory; a rough correction has few digits anyway, and V + δ is computed in the dtype of V
-        single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), equation)
+        single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), _to_neighbours(equation))
         return relaxed(single, grid, self.count).astype(equation.source.dtype)
 
     def relaxations(self, n: int) -> int:
@@ -238,7 +239,13 @@ def left_over(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
         terms = [w * stencil.continued(delta, grid, offset, change=True) for offset, w in jumps]
     else:  # no weight leads out
         terms = [w * stencil.neighbour(delta, grid, offset, ghost=False) for offset, w in jumps]
+    terms += [landing.product(delta) for landing in equation.weights.landings]
     return sum(terms, start=equation.source - delta)
+
+
+def _to_neighbours(equation: PolicyEquation) -> PolicyEquation:
+    """The equation without the weights of jumps to nodes that are not neighbours, which sweeps do not follow."""
+    return dataclasses.replace(equation, weights=dataclasses.replace(equation.weights, landings=()))
 
 
 # x, its residual, (alpha, omega, rho), the direction, its product with A, and the number of steps
@@ -313,9 +320,10 @@ def relaxed(equation: PolicyEquation, grid: Grid, rounds: int) -> Field:
     """Rounds of wavefront Gauss–Seidel from zero; damped Jacobi if diagonal jumps break the wavefront.
 
     At open ends the correction is extrapolated as a constant. For an equation with a parabola beyond them this is a
-    preconditioner, not a solver, since the values outside depend on δ inside.
+    preconditioner, not a solver, since the values outside depend on δ inside. Jumps to nodes that are not neighbours
+    are left out, so it is only a preconditioner for them too.
     """
-    equation = _walled(equation, grid)
+    equation = _walled(_to_neighbours(equation), grid)
     # a diagonal jump may stay on its hyperplane i₀ + i₁ + … = const, whose nodes are updated simultaneously
     if any(sum(abs(offset[axis]) for axis in grid.state_axes) > 1 for offset in equation.weights.offsets):
         return jacobi(equation, grid, 4 * rounds * 2**grid.ndim)  # four for each relaxation of a round
@@ -352,15 +360,19 @@ def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) ->
     def numbers(words: Array) -> np.ndarray:
         return np.ascontiguousarray(words).view(dtype).reshape(grid.shape).astype(np.float64)
 
-    def on_host(source: Array, *weights: Array) -> np.ndarray:
-        delta = factor_and_solve(offsets, [numbers(w) for w in weights], numbers(source), grid, transposed)
+    def on_host(source: Array, far: list, *weights: Array) -> np.ndarray:
+        landings = [Landing(nodes, numbers(rate), back) for (nodes, rate), back in zip(far, backwards, strict=True)]
+        given = [numbers(w) for w in weights]
+        delta = factor_and_solve(offsets, given, numbers(source), grid, landings=landings, transposed=transposed)
         return np.ascontiguousarray(delta.astype(dtype)).view(word).reshape(source.shape)
 
     # a double is two words on an additional axis, a single is one word
-    words = [jax.lax.bitcast_convert_type(array, word) for array in (equation.source, *weights)]
-    result = jax.ShapeDtypeStruct(words[0].shape, word)
+    source, *words = [jax.lax.bitcast_convert_type(array, word) for array in (equation.source, *weights)]
+    backwards = [each.transposed for each in equation.weights.landings]
+    far = [(each.nodes, jax.lax.bitcast_convert_type(each.rate, word)) for each in equation.weights.landings]
+    result = jax.ShapeDtypeStruct(source.shape, word)
     # a callback, since XLA has no sparse LU; sequential, since SuperLU factors one matrix at a time
-    delta = jax.pure_callback(on_host, result, *words, vmap_method="sequential")
+    delta = jax.pure_callback(on_host, result, source, far, *words, vmap_method="sequential")
     return jax.lax.bitcast_convert_type(delta, dtype)
 
 
@@ -369,13 +381,16 @@ def factor_and_solve(
     weights: list[np.ndarray],
     source: np.ndarray,
     grid: Grid,
+    *,
+    landings: Sequence[Landing] = (),
     transposed: bool = False,
 ) -> np.ndarray:
     """Solve (I − W) δ = s, or its transpose; NaN if the matrix is singular."""
     from scipy.sparse.linalg import splu
 
     # I − W with the nodes in C order; CSC is what SuperLU factors
-    matrix = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid)
+    far = [each.weighed(-1) for each in landings]
+    matrix = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid, far)
     try:
         delta = splu(matrix.tocsc()).solve(source.ravel(), "T" if transposed else "N")
     except RuntimeError:  # exactly singular, such as an improper policy; the solve detects the NaN

@@ -61,7 +61,7 @@ def generator(
         modes have a switching cost.
     """
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
-    return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
+    return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid, jumps.landings)
 
 
 @with_mode_axis()
@@ -92,7 +92,7 @@ def matrix(
     """
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
     steps = jumps.scaled(decision_process.time_step(jumps.total()))
-    return stencil.sparse(steps.offsets, steps.values, np.maximum(1 - steps.total(), 0), grid)
+    return stencil.sparse(steps.offsets, steps.values, np.maximum(1 - steps.total(), 0), grid, steps.landings)
 
 
 @with_mode_axis()
@@ -306,10 +306,7 @@ def transition_arrays(
     with own_settings(x64=True):
         cut = Discretisation(*cast((problem, grid), np.float64), scheme, np.dtype(np.float64)).links
         surcharge = decision_process.surcharge(cut, given, grid)
-    tables = (
-        (jumps.offsets, jumps.values, cost + decision_process.paid(jumps, surcharge), ~leaving)
-        for jumps, cost, leaving in found
-    )
+    tables = ((jumps, cost + decision_process.paid(jumps, surcharge), ~leaving) for jumps, cost, leaving in found)
     costs, *chain = decision_process.decision_problem(tables, grid, len(actions), held, given, float(problem.discount))
     return (costs if problem.payoff == COST else 0 - costs, *chain)
 
@@ -324,7 +321,7 @@ def _stationary(name: str, problem: Problem, grid: Grid, policy: Any, disturbanc
     if is_traced(problem, grid, policy, disturbance, t):
         return _stationary_traced(problem, grid, policy, disturbance, scheme, t)
     jumps = _under_policy(problem, grid, policy, disturbance, scheme, t)
-    moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid)
+    moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid, jumps.landings)
     return decision_process.single_law(moves, grid, name).reshape(grid.shape)
 
 
@@ -365,7 +362,9 @@ _advanced = jax.jit(laws.after_duration)
 def _mixed(first: Rates, second: Rates, weight: Any) -> Rates:
     """The rates between two times, the mean with ``weight`` for the second."""
     pairs = zip(first.values, second.values, strict=True)
-    return Rates(first.offsets, tuple((1 - weight) * a + weight * b for a, b in pairs))
+    # jumps may land elsewhere at the second time
+    landings = (*first.scaled(1 - weight).landings, *second.scaled(weight).landings)
+    return Rates(first.offsets, tuple((1 - weight) * a + weight * b for a, b in pairs), landings=landings)
 
 
 def _with_times(actions: tuple, plan: laws.LawSteps) -> tuple:
@@ -398,8 +397,7 @@ def _rates_in_program(problem: Problem, grid: Grid, actions: tuple, scheme: Chai
         active = active & ~(on.level <= 0)
     jumps, _, lacking, leaving = _evaluate(on, u, d, jnp.finfo(dtype).eps)
     faulty = jnp.any(active & (lacking | leaving | ~jnp.isfinite(jumps.total())))
-    values = [jnp.where(faulty, jnp.nan, jnp.where(active, c, 0)).astype(dtype) for c in jumps.values]
-    return Rates(jumps.offsets, tuple(values))
+    return cast(jumps.kept(active).scaled(jnp.where(faulty, jnp.nan, 1)), dtype)
 
 
 def _refuse_changes(problem: Problem) -> None:
@@ -441,8 +439,7 @@ def _checked(
         "a jump rate, made of drift and noise, is not finite", active & ~np.isfinite(jumps.total()), grid
     )
     decision_process.refuse("the noise is correlated more than the spacings allow", active & lacking, grid)
-    kept = Rates(jumps.offsets, tuple(np.where(active, c, 0) for c in jumps.values))
-    return kept, np.where(active, cost, 0), active & leaving
+    return jumps.kept(active), np.where(active, cost, 0), active & leaving
 
 
 def _refuse_ends(grid: Grid) -> None:

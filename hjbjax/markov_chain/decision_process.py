@@ -5,7 +5,7 @@ exports, and lays out their arrays.
 """
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import numpy as np
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.rates import Rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import stationary_law
 from hjbjax.problem.grid import Grid
@@ -25,20 +26,7 @@ from hjbjax.problem.types import Mask
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-Offsets = tuple[tuple[int, ...], ...]
-Table = tuple[Offsets, Sequence[np.ndarray], np.ndarray, np.ndarray]
-
-
-class Jumps(Protocol):
-    """The jumps of a chain and their rates at the nodes, as in ``rates.Rates``."""
-
-    @property
-    def offsets(self) -> Offsets:
-        """The steps along the axes."""
-
-    @property
-    def values(self) -> Sequence[np.ndarray]:
-        """The rates of each jump per unit time, (*grid)."""
+Table = tuple[Rates, np.ndarray, np.ndarray]
 
 
 def time_step(leaving: np.ndarray) -> float:
@@ -166,7 +154,7 @@ def surcharge(links: Sequence[stencil.Links], given: np.ndarray, grid: Grid) -> 
     return extra
 
 
-def paid(jumps: Jumps, extra: dict[tuple[int, ...], np.ndarray]) -> np.ndarray | float:
+def paid(jumps: Rates, extra: dict[tuple[int, ...], np.ndarray]) -> np.ndarray | float:
     """The surcharges per unit time, Σ_o c_o extra_o."""
     return sum(c * extra.get(offset, 0.0) for offset, c in zip(jumps.offsets, jumps.values, strict=True))
 
@@ -177,8 +165,8 @@ def decision_problem(
     """Costs, probabilities, indices and factor for pairs of state and action; see ``chain.transition_arrays``.
 
     Args:
-      tables: for each action the offsets, the rates, the running cost and the nodes where it is admissible; only one
-        action is in memory at a time.
+      tables: for each action the jumps, the running cost and the nodes where it is admissible; only one action is in
+        memory at a time.
       grid: the grid.
       count: the number K of actions.
       held: the nodes of the target, where the tables are zero.
@@ -187,16 +175,22 @@ def decision_problem(
     """
     from scipy.sparse import csr_array
 
-    costs, entries = np.empty((grid.size, count)), np.empty((grid.size, count, 0))
-    offsets: Offsets = ()
-    admissible = np.ones((grid.size, count), bool)
-    for k, (offsets, values, cost, allowed) in enumerate(tables):
+    costs, admissible = np.empty((grid.size, count)), np.ones((grid.size, count), bool)
+    entries, columns = np.empty((0,)), np.empty((0,), int)
+    number = np.arange(grid.size).reshape(grid.shape)
+    for k, (jumps, cost, allowed) in enumerate(tables):
+        ends = (np.roll(number, [-step for step in offset], axis=range(grid.ndim)) for offset in jumps.offsets)
+        found = list(zip(ends, jumps.values, strict=True))
+        found += [(landing.nodes, landing.rate) for landing in jumps.landings]
         if k == 0:  # the last entry of a row is its diagonal
-            entries = np.empty((grid.size, count, len(offsets) + 1))
+            entries = np.empty((grid.size, count, len(found) + 1))
+            # 32-bit indices halve the memory; SciPy requires 64 bits for longer row pointers
+            columns = np.empty(entries.shape, np.int32 if entries.size < 2**31 else np.int64)
+            columns[..., -1] = number.reshape(-1, 1)
         costs[:, k], admissible[:, k] = cost.ravel(), allowed.ravel()
-        for column, c in enumerate(values):
-            entries[:, k, column] = c.ravel()
-    # (S, K, offsets + 1): one Δt for all states and actions, because the decision problem has a single factor
+        for place, (end, c) in enumerate(found):
+            entries[:, k, place], columns[:, k, place] = c.ravel(), end.ravel()
+    # (S, K, jumps + 1): one Δt for all states and actions, because the decision problem has a single factor
     leaving = entries[..., :-1].sum(axis=-1)
     dt = time_step(leaving)
     entries[..., :-1] *= dt
@@ -204,13 +198,9 @@ def decision_problem(
     factor = 1 / (1 + discount * dt)
     # a target keeps its state: (1 − γ) g per step, for all steps, is worth g
     paid = np.where(held.reshape(-1, 1), (1 - factor) * given.reshape(-1, 1), factor * dt * costs)
-    # 32-bit indices halve the memory; SciPy requires 64 bits for longer row pointers
-    number = np.arange(grid.size, dtype=np.int32 if entries.size < 2**31 else np.int64).reshape(grid.shape)
     # every row has the entries of all jumps, so the row pointers are an arithmetic sequence
-    ends = [np.roll(number, [-step for step in offset], axis=range(grid.ndim)) for offset in offsets]
-    columns = np.stack([end.ravel() for end in (*ends, number)], axis=-1)[:, None, :]
-    starts = np.arange(0, entries.size + 1, entries.shape[-1], dtype=number.dtype)
-    layout = (entries.ravel(), np.repeat(columns, count, axis=1).ravel(), starts)
+    starts = np.arange(0, entries.size + 1, entries.shape[-1], dtype=columns.dtype)
+    layout = (entries.ravel(), columns.ravel(), starts)
     probabilities = csr_array(layout, shape=(costs.size, grid.size))
     probabilities.sum_duplicates()  # jumps across the seam of an axis with two nodes coincide; also sorts the columns
     probabilities.eliminate_zeros()

@@ -21,6 +21,7 @@ The stationary law solves 𝓛*μ = 0 with Σ μ = 1. A change of the rates chan
 one sparse linear solve, transposed in reverse mode. With the rank-one term Λ μ Σδ on the left the matrix is regular.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -28,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
+from hjbjax.discretisation.landing import Landing
 from hjbjax.discretisation.rates import Rates
 from hjbjax.hamiltonian.derivatives import once
 from hjbjax.markov_chain import stationary_law
@@ -122,7 +124,7 @@ def flow(jumps: Rates, grid: Grid, law: Field) -> Field:
     for offset, c in zip(jumps.offsets, jumps.values, strict=True):
         back = tuple(-step for step in offset)
         gained = gained + stencil.neighbour(c * law, grid, back, ghost=False)
-    return gained
+    return sum((landing.reversed().product(law) for landing in jumps.landings), start=gained)
 
 
 def after_duration(jumps: Rates, grid: Grid, law: Field, duration: Number) -> Field:
@@ -141,7 +143,7 @@ def after_duration(jumps: Rates, grid: Grid, law: Field, duration: Number) -> Fi
         found = stays * p
         for offset, share in zip(moves.offsets, moves.values, strict=True):
             found = found + share * stencil.neighbour(p, grid, offset, ghost=False)
-        return found
+        return sum((landing.product(p) for landing in moves.landings), start=found)
 
     def term(k: Any, carry: tuple) -> tuple:
         p, weight, total, weights = carry
@@ -167,8 +169,8 @@ def stationary(jumps: Rates, grid: Grid) -> Field:
     """
     shape, dtype = jumps.values[0].shape, jumps.values[0].dtype
 
-    def on_host(*values: np.ndarray) -> np.ndarray:
-        moves = _generator(jumps, grid, values)
+    def on_host(*leaves: np.ndarray) -> np.ndarray:
+        moves = _generator(jumps, grid, leaves)
         if not np.all(np.isfinite(moves.data)):
             return np.full(shape, np.nan)
         classes = stationary_law.classes(moves)
@@ -178,7 +180,7 @@ def stationary(jumps: Rates, grid: Grid) -> Field:
         return (law if error <= stationary_law.LARGEST_ERROR else law * np.nan).reshape(shape)
 
     like: Any = jax.ShapeDtypeStruct(shape, dtype)
-    return call_on_host(on_host, like, *jumps.values, vmap_method="sequential")
+    return call_on_host(on_host, like, *jax.tree.leaves(jumps), vmap_method="sequential")
 
 
 @stationary.defjvp
@@ -188,26 +190,30 @@ def _stationary_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
     jumps, grid = primals
     law = stationary(jumps, grid)
     kept, peak, fastest = jax.lax.stop_gradient((jumps, law, jnp.max(jumps.total())))
-    gained = flow(tangents[0], grid, law) + once((jumps, grid), "a stationary law").astype(law.dtype)
+    far = zip(jumps.landings, tangents[0].landings, strict=True)
+    moved = dataclasses.replace(tangents[0], landings=tuple(Landing(at.nodes, change.rate) for at, change in far))
+    gained = flow(moved, grid, law) + once((jumps, grid), "a stationary law").astype(law.dtype)
 
     def matvec(change: Field) -> Field:
         return fastest * peak * jnp.sum(change) - flow(kept, grid, change)
 
     def solver(transposed: bool) -> Any:
-        def on_host(right: np.ndarray, peak: np.ndarray, *values: np.ndarray) -> np.ndarray:
+        def on_host(right: np.ndarray, peak: np.ndarray, *leaves: np.ndarray) -> np.ndarray:
             moves, number = (
-                _generator(jumps, grid, values),
+                _generator(jumps, grid, leaves),
                 [array.astype(np.float64).ravel() for array in (right, peak)],
             )
             return stationary_law.deviation(moves, *number, transposed=transposed).reshape(right.shape)
 
         like: Any = jax.ShapeDtypeStruct(law.shape, law.dtype)
-        return lambda _, right: call_on_host(on_host, like, right, peak, *kept.values, vmap_method="sequential")
+        leaves = jax.tree.leaves(kept)
+        return lambda _, right: call_on_host(on_host, like, right, peak, *leaves, vmap_method="sequential")
 
     return law, jax.lax.custom_linear_solve(matvec, gained, solver(False), solver(True))
 
 
-def _generator(jumps: Rates, grid: Grid, values: tuple[np.ndarray, ...]) -> Any:
-    """The generator with the offsets of ``jumps`` and these rates, on the host."""
-    rates = [np.asarray(value, np.float64) for value in values]
-    return stencil.sparse(jumps.offsets, rates, -np.sum(rates, axis=0), grid)
+def _generator(jumps: Rates, grid: Grid, leaves: tuple[np.ndarray, ...]) -> Any:
+    """The generator of ``jumps`` with these numbers as its leaves, on the host."""
+    numbers = [leaf.astype(np.float64) if leaf.dtype.kind == "f" else leaf for leaf in map(np.asarray, leaves)]
+    known = jax.tree.unflatten(jax.tree.structure(jumps), numbers)
+    return stencil.sparse(known.offsets, known.values, -known.total(), grid, known.landings)

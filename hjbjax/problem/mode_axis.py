@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.jump_terms import OF_JUMPS
+from hjbjax.problem.jumps import Jump
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import PAYMENTS, Problem
 from hjbjax.problem.pytree import REMEMBERED, altered, as_partial, is_traced
@@ -27,7 +29,7 @@ def in_mode(problem: Problem, mode: int) -> Problem:
     """The problem in one mode, without changes of the mode."""
     names = ("drift", "cost", "noise", *OF_STATE, *PAYMENTS, "discount", "controls")
     fixed = {name: _in_mode(each, mode) for name in names if callable(each := getattr(problem, name))}
-    return altered(problem, modes=None, **fixed)
+    return altered(problem, modes=None, jumps=tuple(_jump_in_mode(jump, mode) for jump in problem.jumps), **fixed)
 
 
 def over_modes(problem: Problem, n: int) -> Problem:
@@ -50,7 +52,7 @@ def over_modes(problem: Problem, n: int) -> Problem:
     count, place = len(modes.names), int(problem.time_dependent)
     fixed = {
         name: _over(each, count, place)
-        for name in ("cost", *OF_STATE, "discount", "controls")
+        for name in ("cost", *OF_STATE, *OF_JUMPS, "discount", "controls")
         if callable(each := getattr(problem, name))
     }
     rates, costs = modes.rates, modes.switching_cost
@@ -107,6 +109,12 @@ def without_modes(grid: Grid) -> Grid:
 def _in_mode(function: jax.tree_util.Partial, mode: int) -> jax.tree_util.Partial:
     """A function with its last argument fixed."""
     return jax.tree_util.Partial(_fixed(function.func, mode), (function.args, function.keywords))
+
+
+def _jump_in_mode(jump: Jump, mode: int) -> Jump:
+    """A jump whose functions have their last argument fixed."""
+    functions = {name: getattr(jump, name) for name in ("rate", "landing", "cost")}
+    return altered(jump, **{name: _in_mode(each, mode) for name, each in functions.items() if callable(each)})
 
 
 def _over(
@@ -208,11 +216,16 @@ def _of_mode(function: Callable, numbers: Array, *arguments: Any) -> Array:
 
 
 def refuse_modes(problem: Problem) -> None:
-    """Refuse a problem with modes in a function that does not support them.
+    """Refuse a problem with modes or jumps in a function that does not support them.
 
     Raises:
-      ValueError: the problem has modes.
+      ValueError: the problem has modes or jumps.
     """
+    if problem.jumps:
+        raise ValueError(
+            f"Problem.jumps: got a problem with {len(problem.jumps)} jumps, which this function does not take; wanted "
+            "a problem without jumps"
+        )
     if problem.modes is not None:
         raise ValueError(
             f"Problem.modes: got a problem with the modes {problem.modes.names!r}, which this function does not take; "

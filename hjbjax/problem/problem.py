@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import labels as labelling
+from hjbjax.problem.jumps import Jump
 from hjbjax.problem.labels import COST, REWARD, Labels
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
@@ -39,6 +40,7 @@ class Problem:
     ``(x, u, d)`` if ``disturbances`` is given. ``target``, ``running_max`` and the payments ``exit_cost``,
     ``terminal_cost`` and ``stopping_cost``, or the rewards of the same names, take ``(x)``. With
     ``time_dependent=True`` the time comes first in all, and with ``modes`` the number of the mode comes last in all.
+    Functions of ``jumps`` take the same arguments as ``drift``.
 
     The control minimises costs. Give ``reward`` and the other rewards instead to maximise: the value is then the
     largest reward, and the disturbance minimises it. Value, bounds, derivatives and pictures have the sign of the
@@ -68,6 +70,7 @@ class Problem:
       stopping_reward: the reward for stopping, at any time: V ≥ the reward, as for an American option.
       modes: the regimes between which the system changes at random or by choice, see ``Modes``. Values then have the
         shape (k, *grid).
+      jumps: sudden moves of the state at random times, a list of ``Jump``.
       isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min. With rewards
         the disturbance also sees u if ``"upper"``: max over u of min over d.
       time_dependent: True if the functions take the time as their first argument.
@@ -101,6 +104,7 @@ class Problem:
     stopping_cost: Any = None
     running_max: Any = None
     modes: Modes | None = None
+    jumps: tuple[Jump, ...] = ()
     isaacs: str = "upper"
     time_dependent: bool = False
     control_names: tuple[str, ...] = ()
@@ -117,6 +121,10 @@ class Problem:
     # the changes of the mode if the state begins with it, see ``mode_axis``: rates, and costs for the controller
     mode_rates: Any = dataclasses.field(init=False, default=None, repr=False)
     switching_costs: Any = dataclasses.field(init=False, default=None, repr=False)
+    # the jumps as functions, see ``jump_terms``
+    intensities: Any = dataclasses.field(init=False, default=None, repr=False)
+    landings: Any = dataclasses.field(init=False, default=None, repr=False)
+    jump_costs: Any = dataclasses.field(init=False, default=None, repr=False)
 
     def __init__(
         self,
@@ -133,6 +141,7 @@ class Problem:
         stopping_cost: Callable | Number | None = None,
         running_max: Callable | None = None,
         modes: Modes | None = None,
+        jumps: Sequence[Jump] = (),
         isaacs: str = "upper",
         time_dependent: bool = False,
         control_names: Sequence[str] = (),
@@ -156,6 +165,8 @@ class Problem:
             raise TypeError(f"Problem.time_dependent: got {time_dependent!r}, wanted True or False")
         if modes is not None and not isinstance(modes, Modes):
             raise TypeError(f"Problem.modes: got {modes!r}, wanted hjb.Modes(('low', 'high'), rates=...)")
+        if not isinstance(jumps, (list, tuple)) or not all(isinstance(jump, Jump) for jump in jumps):
+            raise TypeError(f"Problem.jumps: got {jumps!r}, wanted a list, as in [hjb.Jump(rate, landing)]")
         # with a running maximum, V ≥ g, there is no integral to discount, so β V − L has no meaning
         if running_max is not None and (cost is not None or _is_nonzero(discount)):
             raise ValueError(
@@ -184,6 +195,7 @@ class Problem:
             "target": as_partial(target, "Problem.target"),
             "running_max": as_partial(running_max, "Problem.running_max"),
             "modes": modes,
+            "jumps": tuple(jumps),
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
             "control_names": words.controls,
@@ -195,6 +207,9 @@ class Problem:
             "killing": None,
             "mode_rates": None,
             "switching_costs": None,
+            "intensities": None,
+            "landings": None,
+            "jump_costs": None,
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -241,9 +256,10 @@ def is_discounted(problem: Problem) -> bool | None:
 
 
 def is_random(problem: Problem) -> bool:
-    """True if paths of the problem are random: noise, or random changes of the mode."""
+    """True if paths of the problem are random: noise, jumps, or random changes of the mode."""
+    jumps = bool(problem.jumps) or problem.intensities is not None
     changes = problem.mode_rates is not None or (problem.modes is not None and problem.modes.rates is not None)
-    return problem.noise is not None or changes
+    return problem.noise is not None or jumps or changes
 
 
 def is_constrained(problem: Problem) -> bool:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem.jump_terms import OF_JUMPS
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.sets import AnyControl, Box
@@ -69,7 +70,7 @@ def in_unit_box(problem: Problem, n: int) -> Problem:
     if not callable(problem.controls):
         return problem
     m = count_of(problem, n)
-    named = {name: getattr(problem, name) for name in ("drift", "cost", "noise", "mode_rates")}
+    named = {name: getattr(problem, name) for name in ("drift", "cost", "noise", "mode_rates", *OF_JUMPS)}
     changed = {name: _of_v(each, problem) for name, each in named.items() if callable(each)}
     return altered(problem, controls=Box(-np.ones(m), np.ones(m)), **changed)
 

@@ -42,6 +42,7 @@ def in_own_time(problem: Problem) -> Problem:
         "cost": None if problem.cost is None else _over(problem.cost, problem.discount, 1),
         "noise": None if noise is None else _over(noise, problem.discount, 2),
         "mode_rates": None if problem.mode_rates is None else _over(problem.mode_rates, problem.discount, 1),
+        "intensities": None if problem.intensities is None else _over(problem.intensities, problem.discount, 1),
     }
     return altered(problem, discount=1.0, discounted=True, **scaled)
 

@@ -15,7 +15,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
-from hjbjax.problem.problem import is_constrained
+from hjbjax.problem.problem import is_constrained, is_random
 from hjbjax.problem.pytree import cast
 from hjbjax.problem.types import AtNodes, Nodes
 from hjbjax.semi_lagrangian import arcs
@@ -57,7 +57,7 @@ def _may_rest(task: Task) -> bool:
     """True if nothing else makes a policy arrive: no discount, no positive running cost, no noise."""
     problem = task.problem
     undiscounted = np.all(np.asarray(problem.discount) == 0)
-    one_player = not problem.is_game and problem.noise is None and task.mesh is None
+    one_player = not problem.is_game and not is_random(problem) and task.mesh is None
     if not (undiscounted and one_player) or problem.target is None or problem.exit_cost is None:
         return False
     if task.least_cost is not None:  # stored only where it is positive: resting then costs indefinitely

@@ -26,6 +26,7 @@ import numpy as np
 
 from hjbjax.discretisation import edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.landing import Landing
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.evaluation import factor_and_solve
@@ -171,12 +172,12 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     value, scale = start, np.ptp(start[np.asarray(level.counted)])
     moved = np.zeros(grid.shape, bool)
     for step in range(STEPS):
-        source, weights = jax.device_get(_equation(others, value, obstacles, defect))
+        source, weights, landings = jax.device_get(_equation(others, value, obstacles, defect))
         if step == 0:
             moved = np.abs(source) > ROUNDING * scale
             if not np.any(moved):
                 return BoxError(None, NEVER_REACHED)
-        delta = factor_and_solve(list(weights), list(weights.values()), source, grid)
+        delta = factor_and_solve(list(weights), list(weights.values()), source, grid, landings=landings)
         value, largest = value + delta, np.max(np.abs(delta))
         change = np.abs(value - start)
         if not np.isfinite(largest) or np.max(change) > FARTHEST * scale:
@@ -199,7 +200,9 @@ def _defect(task: Task, value: Field) -> tuple[Field, bellman.Greedy]:
 
 
 @jax.jit
-def _equation(on: Discretisation, value: Field, obstacles: Obstacles, defect: Field) -> tuple[Field, dict]:
+def _equation(
+    on: Discretisation, value: Field, obstacles: Obstacles, defect: Field
+) -> tuple[Field, dict, tuple[Landing, ...]]:
     """The right-hand side and the weights of Newton's equation for G(W) = F(V), F(V) being the ``defect``."""
     policy = bellman.greedy(on, value, obstacles.fixed)
     policy = dataclasses.replace(policy, defect=policy.defect - jnp.where(obstacles.fixed, 0, defect))
@@ -208,7 +211,7 @@ def _equation(on: Discretisation, value: Field, obstacles: Obstacles, defect: Fi
     weights: dict[tuple[int, ...], Any] = {}
     for offset, entry in zip(offsets, entries, strict=True):
         weights[offset] = weights[offset] + entry if offset in weights else entry
-    return equation.source, weights
+    return equation.source, weights, equation.weights.landings
 
 
 def _fixed_next_to_lost(task: Task) -> Obstacles:

@@ -26,6 +26,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.types import DType
 from hjbjax.tracing import checks
+from hjbjax.tracing.dependence import influence
 
 
 def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
@@ -50,6 +51,7 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType) -> in
         weights = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
         if problem.noise is None and method.evaluation.rough:
             weights = n  # one direction per axis, since sweeps may merge both
+        weights += _sudden(problem, grid, dtype)
         correction = method.evaluation.bytes_per_node(weights, word)
     elif is_discounted(problem) and not searched:
         # the actions, computed at the end, and the outflow Q + β; a step computes only the defect
@@ -90,6 +92,15 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
         wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or plain else 6
         filling += word * (actions + wide) + 2
     return math.ceil(((kept - 1) * one + stored + max(steps, filling)) * grid.size)
+
+
+def _sudden(problem: Problem, grid: Grid, dtype: DType) -> int:
+    """Weights per node for sudden changes: jumps between k modes, their inverse, and the corners of landings."""
+    count = len(grid.modes)
+    corners = 2 ** len(grid.state_axes)
+    jumps = 0 if problem.landings is None else len(influence(problem, grid.ndim, dtype).landing.entries)
+    # an index takes half of a word
+    return 2 * count + math.ceil(1.5 * corners * jumps / max(len(grid.state_axes), 1))
 
 
 def _actions(problem: Problem) -> int:
@@ -213,9 +224,11 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     checks.check_indices(grid)
     # memory is proportional to the number of nodes
     if free is not None and needed > free:
+        each = max(len(grid.modes), 1)
         raise MemoryError(
             f"{as_counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
-            f"{_largest(free / needed * grid.size, grid.ndim)}; max_memory= (bytes) overrides what counts as free.\n"
+            f"{_largest(free / needed * grid.size / each, len(grid.state_axes))}; max_memory= (bytes) overrides what "
+            "counts as free.\n"
             f"dtype='float32' takes about half; {NO_GRID}."
         )
     return needed

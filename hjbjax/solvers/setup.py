@@ -81,9 +81,10 @@ def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool, divided: bo
     if grid.sides("open"):  # sweeps do not support extrapolated values; see ``relaxed``
         small = grid.ndim < 3 and grid.size <= DIRECT and not divided
         return Direct() if small else Krylov()
-    if problem.noise is None and not grid.modes:
+    far = problem.landings is not None  # sweeps do not follow jumps of the state
+    if problem.noise is None and not grid.modes and not far:
         return Sweeps(BETWEEN_PARTS) if divided and grid.size > MANY else Sweeps()
-    return Krylov() if traced or divided or grid.modes else linear_solve(grid)
+    return Krylov() if traced or divided or grid.modes or far else linear_solve(grid)
 
 
 def march_evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> Evaluation:
@@ -91,7 +92,7 @@ def march_evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> 
     if grid.sides("open"):
         return choose_evaluation(problem, grid, traced=False, divided=divided)
     # sweeps follow the drift and are slow if noise spreads information in both directions
-    return Sweeps() if problem.noise is None else Krylov()
+    return Sweeps() if problem.noise is None and problem.landings is None else Krylov()
 
 
 def choose_scheme(on: Discretisation, method: Method) -> Scheme:

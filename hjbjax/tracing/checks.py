@@ -23,10 +23,13 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import indices, jaxprs
 from hjbjax.tracing.operations import Operations, operations
 
-OF_ACTION = ("drift", "cost", "noise", "mode_rates")
+OF_ACTION = ("drift", "cost", "noise", "mode_rates", "intensities", "landings")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
 RATES = ("discount", "killing")
-USERS_NAMES = {"killing": "discount", "mode_rates": "Modes.rates", "switching_costs": "Modes.switching_cost"}
+USERS_NAMES = {
+    "killing": "discount", "mode_rates": "Modes.rates", "switching_costs": "Modes.switching_cost",
+    "intensities": "Jump.rate", "landings": "Jump.landing",
+}  # fmt: skip
 
 _ADVICE = (  # most specific first, since TracerBoolConversionError is a ConcretizationTypeError
     (
@@ -140,6 +143,20 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
         expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
         for name in ("cost", "target", *STATE_COSTS, *RATES):
             expect(name, "()", lambda shape: shape == ())
+
+
+def jumps_of_one_state(problem: Problem, n: int) -> None:
+    """Refuse functions of a jump that cannot be traced on one state of ``n`` numbers, or return the wrong shape.
+
+    Raises:
+      ValueError: names the jump.
+    """
+    lengths, letters = _lengths(problem, n), problem.arguments("x", "u", "d", "t")
+    for number, jump in enumerate(problem.jumps):
+        for name, wanted in (("rate", ()), ("landing", (n,)), ("cost", ())):
+            if callable(function := getattr(jump, name)):
+                said = f"Problem.jumps[{number}].{name}: {name}"
+                function_of(function, said, wanted, **{letter: lengths[letter] for letter in letters})
 
 
 # --- on one state ---
@@ -349,6 +366,8 @@ def over_devices(
         raise ValueError(f"{caller}: mesh divides the nodes at host level only; leave it out inside jit, vmap and grad")
     if grid.modes:
         raise ValueError(f"{caller}: a problem with modes is solved on one device; leave out mesh")
+    if problem.landings is not None:
+        raise ValueError(f"{caller}: a problem with jumps is solved on one device; leave out mesh")
     refuse_prescribed(grid, caller, "whose numbers are not divided over a mesh")
     if problem_calls_back(problem, grid.ndim):
         raise ValueError(

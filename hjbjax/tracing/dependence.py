@@ -136,7 +136,8 @@ class Influence:
     """Dependence of drift, cost and noise on both players' inputs, the control's first, then the disturbance's.
 
     Attributes:
-      drift, cost, noise, switching: the dependences; the last one of the rates of changes of the mode.
+      drift, cost, noise, switching, landing: the dependences; the last two of the rates of jumps, including changes of
+        the mode, and of the states after the jumps.
       control, disturbance: the inputs of each player.
     """
 
@@ -144,20 +145,22 @@ class Influence:
     cost: Dependence
     noise: Dependence
     switching: Dependence
+    landing: Dependence
     control: range
     disturbance: range
 
     @property
     def separable(self) -> bool:
-        """True if drift, cost and rates are sums of one part per player, and the noise depends on neither."""
+        """True if drift, cost and rates are sums of one part per player; noise and landings depend on neither."""
         functions = (self.drift, self.cost, self.switching)
         crossed = any(function.crosses(self.control, self.disturbance) for function in functions)
-        return not crossed and self.noise.is_constant
+        return not crossed and self.noise.is_constant and self.landing.is_constant
 
     @property
     def operations(self) -> Operations:
-        """The operations of one evaluation of drift, cost, noise and rates."""
-        return self.drift.operations + self.cost.operations + self.noise.operations + self.switching.operations
+        """The operations of one evaluation of all these functions."""
+        each = (self.drift, self.cost, self.noise, self.switching, self.landing)
+        return sum((found.operations for found in each), start=NONE)
 
     @property
     def meet(self) -> bool:
@@ -174,9 +177,12 @@ def influence(problem: Problem, n: int, dtype: DType) -> Influence:
     def of(function: object) -> Dependence:
         return dependence(function, *arguments, dtype=dtype) if callable(function) else Dependence((CONSTANT,))
 
-    return Influence(
-        of(problem.drift), of(problem.cost), of(problem.noise), of(problem.mode_rates), range(m), range(m, m + k)
+    rates = [of(each) for each in (problem.mode_rates, problem.intensities) if each is not None]
+    switching = Dependence(
+        sum((each.entries for each in rates), start=()) or (CONSTANT,), sum((each.operations for each in rates), NONE)
     )
+    landing, players = of(problem.landings), (range(m), range(m, m + k))
+    return Influence(of(problem.drift), of(problem.cost), of(problem.noise), switching, landing, *players)
 
 
 def _some_function(operands: Iterable[Terms]) -> Terms:

@@ -10,7 +10,7 @@ however long.
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ import numpy as np
 
 from hjbjax.discretisation import edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.landing import Landing
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem import sets
@@ -50,17 +51,22 @@ def _open_jumps(
     return known
 
 
-@jax.jit  # never executed, only traced
+@jax.jit  # only traced, and executed for jumps of the state
 def _jumps_of(on: Discretisation, action: Array) -> Rates:
     """The jumps under one action at every node, shape (m,)."""
     return jump_rates(on, list(action))
 
 
 def _no_jumps(on: Discretisation, points: Array) -> Rates:
-    """The possible jumps of the chain, none of them open."""
+    """The possible jumps of the chain, none of them open; landings must not depend on the action."""
     # the offsets depend on the noise, not on the action
     offsets = _jumps_of.eval_shape(on, jax.ShapeDtypeStruct(np.shape(points)[1:], on.dtype)).offsets
-    return Rates(offsets, tuple(np.zeros(on.grid.shape, bool) for _ in offsets))
+    none: Any = np.zeros(on.grid.shape, bool)
+    far: tuple[Landing, ...] = ()
+    if on.problem.landings is not None:
+        found = _jumps_of(on, jnp.asarray(points[0], on.dtype)).landings
+        far = tuple(Landing(np.asarray(landing.nodes), none) for landing in found)
+    return Rates(offsets, (none,) * len(offsets), landings=far)
 
 
 @functools.partial(jax.jit, static_argnames=("kinks", "others"))
@@ -87,7 +93,7 @@ def _more_open_jumps(
             stays = ~edges.inadmissible(on, each)
             if inside is not None:
                 stays &= _stays(rates, grid, inside, least)
-            opened = tuple(p | ((c > least) & stays) for p, c in zip(opened, rates.values, strict=True))
+            opened = tuple(p | ((c > least) & stays) for p, c in zip(opened, _all_rates(rates), strict=True))
         return opened
 
     def also(k: Scalar, opened: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -95,8 +101,15 @@ def _more_open_jumps(
         return tried(tried_actions.with_kinks(on, mine, action) if kinks else [action], opened)
 
     first = tried_actions.beside_samples(on, mine) if others else []
-    opened = tried(first, tuple(map(jnp.asarray, known.values)))
-    return Rates(known.offsets, jax.lax.fori_loop(*lot, also, opened))
+    opened = jax.lax.fori_loop(*lot, also, tried(first, tuple(map(jnp.asarray, _all_rates(known)))))
+    count = len(known.offsets)
+    far = zip(known.landings, opened[count:], strict=True)
+    return Rates(known.offsets, opened[:count], landings=tuple(Landing(each.nodes, mask) for each, mask in far))
+
+
+def _all_rates(rates: Rates) -> list[jax.Array]:
+    """The rates of jumps to neighbours, then of jumps to other nodes."""
+    return [*rates.values, *(landing.rate for landing in rates.landings)]
 
 
 def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Array:
@@ -105,6 +118,8 @@ def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Ar
     for offset, c in zip(rates.offsets, rates.values, strict=True):
         # no jump leaves the box: rates that lead out are zero
         stays &= (c <= least) | stencil.neighbour(inside, grid, offset)
+    for landing in rates.landings:
+        stays &= (landing.rate <= least) | landing.ahead(inside)
     return stays
 
 
@@ -135,6 +150,9 @@ def reached(
     """
     on = on.on_grid(stencil.walled(on.grid))  # a path that leaves through an open end may not return
     clock, found, maybe = clock or Clock(), np.zeros(on.grid.shape, bool), np.zeros(on.grid.shape, bool)
+    if on.players.control.lands:  # the jumps of an action are not a set of nodes that all actions share
+        steered = forced(on, held, least=least, clock=clock)
+        return Reach(steered, steered)
     points, few = tried_actions.control_samples(on.problem)
     # A few actions suffice for most problems. Nodes that samples do not reach may be reached by an action that keeps
     # exactly to a path. Every pass uses admissible actions only, so the union of the passes is also reachable.
@@ -174,7 +192,8 @@ def _reached_by(
 
     def staying(inside: jax.Array | None) -> np.ndarray:
         jumps = open_jumps(inside=inside)
-        jumps = Rates((*jumps.offsets, *changes.offsets), (*jumps.values, *_led_inside(changes, inside, grid)))
+        leading = (*jumps.values, *_led_inside(changes, inside, grid))
+        jumps = Rates((*jumps.offsets, *changes.offsets), leading, landings=jumps.landings)
         return _backward_reach(held, jumps, grid, clock)
 
     maybe = found = staying(None)
@@ -226,9 +245,9 @@ def _controllable_predecessors(
             u, d = (first, second) if upper else (second, first)
             rates = jump_rates(on, list(u), list(d))
             jumps = zip(rates.offsets, rates.values, strict=True)
-            leads = functools.reduce(
-                jnp.logical_or, ((c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps)
-            )
+            leading = [(c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps]
+            leading += [(landing.rate > least) & landing.ahead(found) for landing in rates.landings]
+            leads = functools.reduce(jnp.logical_or, leading)
             allowed = ~edges.inadmissible(on, list(u), list(d))
             # for every disturbance one jump must lead on, and none may leave
             good = leads & allowed & _stays(rates, grid, inside, least)
@@ -325,6 +344,8 @@ def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) ->
         before, rounds = int(np.count_nonzero(found)), rounds + 1
         for axis, opened in lines.items():
             found = _swept(found, axis, opened)
+        for landing in jumps.landings:
+            found = found | (np.asarray(landing.rate) & found.reshape(-1)[np.asarray(landing.nodes)])
     return found
 
 
@@ -364,6 +385,10 @@ def _searched(held: np.ndarray, jumps: Rates, grid: Grid) -> np.ndarray:
         leaves = ~held & np.asarray(jump)
         starts.append(np.flatnonzero(leaves))
         ends.append(stencil.neighbour_numbers(grid, offset)[leaves])
+    for landing in jumps.landings:
+        leaves = ~held & np.asarray(landing.rate)
+        starts.append(np.flatnonzero(leaves))
+        ends.append(np.asarray(landing.nodes)[leaves])
     backward = np.concatenate(ends), np.concatenate(starts)
     # the reversed jumps lead from the target to all nodes that can reach it
     graph = csr_array((np.ones(len(backward[0])), backward), shape=(grid.size + 1, grid.size + 1))

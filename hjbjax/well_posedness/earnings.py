@@ -53,8 +53,8 @@ def earned(task: Task, state: State) -> Earning | None:
     if not np.all(np.isfinite(cost[going])) or not np.any(cost[going] < 0):
         return None
     # the rows of a generator sum to zero
-    values = [np.where(going, rate, 0) for rate in jumps.values]
-    generator = stencil.sparse(jumps.offsets, values, -np.sum(values, axis=0), task.grid)
+    jumps = jumps.kept(going)
+    generator = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), task.grid, jumps.landings)
     for states in stationary_law.classes(generator):
         # a fixed node is a separate class, without further payments
         if not going.flat[states[0]]:

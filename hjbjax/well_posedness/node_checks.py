@@ -67,6 +67,15 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
     if "negative rate" in found and found["negative rate"].nodes:
         where = _where(problem, grid, found["negative rate"], actions)
         raise ValueError(f"{call(problem, 'mode_rates')} is negative at {where}.\nWanted rates ≥ 0, per unit time")
+    if "negative intensity" in found and found["negative intensity"].nodes:
+        where = _where(problem, grid, found["negative intensity"], actions)
+        raise ValueError(f"{call(problem, 'intensities')} is negative at {where}.\nWanted rates ≥ 0, per unit time")
+    if "leaving jump" in found and found["leaving jump"].nodes:
+        raise ValueError(
+            f"{call(problem, 'landings')} is outside the box, across a constrained or Robin end, at "
+            f"{_where(problem, grid, found['leaving jump'], actions)}.\nWanted jumps inside the box: limit the "
+            "landing, as in jnp.maximum(y, lo), or choose another end"
+        )
     if "correlation" in found and found["correlation"].nodes:
         _refuse_noise(on, found["correlation"], actions)
     if "diffusion" in found and found["diffusion"].nodes:
@@ -217,7 +226,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
 
 def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, jax.Array]:
     """The nodes where drift, cost or noise is faulty under one action, by the name of the fault."""
-    problem = on.problem
+    problem, arguments = on.problem, on.problem.arguments(x, u, d, 0.0)
 
     def faulty(entries: Iterable[Numbers]) -> jax.Array:
         return functools.reduce(jnp.logical_or, (~jnp.isfinite(jnp.asarray(entry, on.dtype)) for entry in entries))
@@ -230,13 +239,18 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, j
     if a:
         bad["noise"] = faulty(a.values())
     if callable(problem.noise):
-        sigma = components.components(problem.noise, *problem.arguments(x, u, d, 0.0), dtype=on.dtype)
+        sigma = components.components(problem.noise, *arguments, dtype=on.dtype)
         # entries of a matrix may be negative, like correlations; a number or a diagonal is a size
         if sigma.ndim < 2:
             bad["negative"] = functools.reduce(jnp.logical_or, (jnp.asarray(entry) < 0 for entry in sigma.flat))
     if rates := on.mode_rates(u, d, x):
         bad["mode_rates"] = faulty(rates)
         bad["negative rate"] = functools.reduce(jnp.logical_or, (rate < 0 for rate in rates))
+    if rates := on.intensities(u, d, x):
+        bad["intensities"] = faulty(rates)
+        bad["negative intensity"] = functools.reduce(jnp.logical_or, (rate < 0 for rate in rates))
+        bad["landings"] = faulty(components.components(problem.landings, *arguments, dtype=on.dtype).flat)
+        bad["leaving jump"] = functools.reduce(jnp.logical_or, (each.leaves for each in on.landings(u, d, x)))
     # diagonal jumps take their rates from the jumps along the axes, which must not become negative
     lacking = correlated_noise.lacking(on, a)
     if lacking is not None:

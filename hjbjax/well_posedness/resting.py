@@ -60,7 +60,7 @@ def standstill(on: Discretisation) -> Standstill:
     rests = (jnp.abs(effort) <= small * cost) & (jnp.abs(least) <= small * cost)
     for axis, speed in enumerate(_noise_speeds(on, u, d)):
         rests &= speed <= small * speeds[axis]
-    for rate in on.mode_rates(u, d):  # in another mode it may move
+    for rate in (*on.mode_rates(u, d), *on.intensities(u, d)):  # in another mode, or after a jump, it may move
         rests &= rate == 0
     # axes one after another: an upper bound for any direction of motion
     extents = jnp.stack([jnp.asarray(grid.hi[axis] - grid.lo[axis], dtype) for axis in grid.state_axes])

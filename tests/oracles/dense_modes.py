@@ -22,12 +22,25 @@ def chain_rows(axes, f, a, node):
     return found
 
 
+def landing_rows(axes, y, node_of, rate):
+    """The jumps to the corners of the cell of y, which is moved into the box: pairs of another node and a rate."""
+    cells = []
+    for x, entry in zip(axes, y, strict=True):
+        entry = min(max(entry, x[0]), x[-1])
+        k = min(int(np.searchsorted(x, entry, side="right")) - 1, len(x) - 2)
+        share = (entry - x[k]) / (x[k + 1] - x[k])
+        cells.append([(k, 1 - share), (k + 1, share)])
+    for corner in itertools.product(*cells):
+        yield node_of(tuple(k for k, _ in corner)), rate * np.prod([share for _, share in corner])
+
+
 def solve(axes, modes, actions, drift, cost, *, noise=None, rates=None, switching=None, discount=0.0, target=None,
-          exit_cost=None):  # fmt: skip
+          exit_cost=None, jumps=()):  # fmt: skip
     """V of shape (k, *grid) and the chosen action at every node, −1 − j for a change to mode j.
 
     ``drift(x, u, i)``, ``cost``, ``noise`` (σ per axis), ``rates`` (k, k) and ``switching`` (k, k) are plain functions;
-    ``target(x, i)`` is true where the run ends and pays ``exit_cost(x, i)``.
+    ``target(x, i)`` is true where the run ends and pays ``exit_cost(x, i)``. A jump is a triple of ``rate(x, u, i)``,
+    ``landing(x, u, i)`` and ``cost(x, u, i)``.
     """
     shape = tuple(map(len, axes))
     nodes = [(i, *node) for i in range(modes) for node in itertools.product(*map(range, shape))]
@@ -49,8 +62,14 @@ def solve(axes, modes, actions, drift, cost, *, noise=None, rates=None, switchin
                     if j != i:
                         row[k] += rate
                         row[number[(j, *node)]] -= rate
+            paid = cost(x, u, i)
+            for rate, landing, price in jumps:
+                paid += rate(x, u, i) * price(x, u, i)
+                row[k] += rate(x, u, i)
+                for there, part in landing_rows(axes, landing(x, u, i), lambda node: number[(i, *node)], rate(x, u, i)):  # noqa: B023
+                    row[there] -= part
             row[k] += discount
-            rows.append((row, cost(x, u, i), name))
+            rows.append((row, paid, name))
         if switching is not None:
             for j, paid in enumerate(switching(x)[i]):
                 if j != i and np.isfinite(paid):

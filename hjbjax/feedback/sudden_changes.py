@@ -1,13 +1,13 @@
-"""Changes of the mode along a path, at random and by choice.
+"""Sudden changes along a path: jumps of the state, and changes of the mode at random and by choice.
 
-The state of the loop is (i, x, s, n): the mode, the state, a clock with
+The state of the loop is (i, x, s, n): the mode, if there are modes, the state, a clock with
 
-    ds = −Σ_j λ_ij(x, u, d) dt
+    ds = −Σ_j λ_j(x, u, d) dt
 
-that starts from a draw of the exponential law with mean one, and the number of random changes so far. When the clock
-reaches zero, the mode changes to j with probability λ_ij/Σ_j λ_ij, and the clock starts again. This is the law of the
-changes, without an error of the steps. The n-th change has the n-th draw of the key, so that rounding errors in the
-time of a change do not alter the later changes.
+that starts from a draw of the exponential law with mean one, and the number of random changes so far. The sum is over
+the jumps of the state and the changes to other modes. When the clock reaches zero, the change j happens with
+probability λ_j/Σ λ, and the clock starts again. This is the law of the changes, without an error of the steps. The n-th
+change has the n-th draw of the key, so that rounding errors in the time of a change do not alter the later changes.
 The controller changes the mode where V_i = c_ij + V_j at every surrounding node, and pays c_ij.
 """
 
@@ -29,18 +29,19 @@ from hjbjax.problem.pytree import altered, as_partial, pytree_dataclass
 from hjbjax.problem.types import Array, Key, Number
 
 STREAM = 0x6D6F  # folded into the key, so that the draws are independent of the other draws of a path
-STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "target", "switching_costs")
+OF_STATE = ("exit_cost", "terminal_cost", "stopping_cost", "target", "switching_costs")
+OF_ACTION = ("cost", "mode_rates", "intensities", "landings", "jump_costs")
 
 
 @pytree_dataclass(static=("name",))
 class Clocked:
-    """A function of a problem whose state begins with the mode, as a function of the state with clock and count."""
+    """A function of a problem as a function of the state with clock and count."""
 
     problem: Problem
     name: str
 
     def __call__(self, *arguments: Any) -> Array:
-        """The value at the problem's arguments, with (i, x, s, n) instead of (i, x)."""
+        """The value at the problem's arguments, with clock and count at the end of the state."""
         problem, place = self.problem, int(self.problem.time_dependent)
         z = arguments[place][:-2]
         own = (*arguments[:place], z, *arguments[place + 1 :])
@@ -52,10 +53,14 @@ class Clocked:
         found = ingredient(*own) if callable(ingredient) else ingredient
         if self.name != "drift":
             return found
-        leaving = 0.0 if problem.mode_rates is None else jnp.sum(problem.mode_rates(*own))
-        return jnp.append(
-            jnp.asarray(found, z.dtype), jnp.stack([jnp.asarray(-leaving, z.dtype), jnp.zeros((), z.dtype)])
-        )
+        leaving = jnp.sum(rates_of_changes(problem, own, z.dtype))
+        return jnp.concatenate([jnp.asarray(found, z.dtype), jnp.stack([-leaving, jnp.zeros((), z.dtype)])])
+
+
+def rates_of_changes(problem: Problem, arguments: tuple, dtype: Any) -> Array:
+    """The rates of the changes to the next modes, then of the jumps of the state, one vector."""
+    functions = [each for each in (problem.mode_rates, problem.intensities) if each is not None]
+    return jnp.concatenate([jnp.zeros(0, dtype), *(jnp.asarray(each(*arguments), dtype) for each in functions)])
 
 
 def refuse_mode(modes: Modes | None, mode: object, name: str) -> None:
@@ -88,19 +93,24 @@ def grid_of_modes(grid: Grid | None, modes: Modes | None) -> Grid | None:
     return grid if grid is None or modes is None else with_modes(grid, modes.names)
 
 
+def has_clock(problem: Problem, modes: int) -> bool:
+    """True if a path may change suddenly; ``modes`` is the number of modes, zero without modes."""
+    return bool(modes) or problem.intensities is not None
+
+
 def with_clock(loop: Loop, x0: Any, key: Key | None, count: int) -> tuple[Loop, Any]:
-    """The loop and its start with clock and count appended to the state; unchanged without modes.
+    """The loop and its start with clock and count appended to the state; unchanged without sudden changes.
 
     Args:
-      loop: the loop of a problem whose state begins with the mode.
+      loop: the loop of a problem whose state begins with the mode, if there are modes.
       x0: its initial state (i, x).
       key: the key of the path.
       count: the number of modes k; zero without modes.
     """
     problem = loop.problem
-    if not count:
+    if not has_clock(problem, count):
         return loop, x0
-    names = ["drift", *(name for name in ("cost", "mode_rates", *STATE_COSTS) if getattr(problem, name) is not None)]
+    names = ["drift", *(name for name in (*OF_ACTION, *OF_STATE) if getattr(problem, name) is not None)]
     names += ["discount"] * callable(problem.discount)
     changed: dict[str, Any] = {name: as_partial(Clocked(problem, name)) for name in names}
     if callable(problem.noise):
@@ -109,7 +119,8 @@ def with_clock(loop: Loop, x0: Any, key: Key | None, count: int) -> tuple[Loop, 
         changed["noise"] = jnp.pad(problem.diffusion(jnp.zeros(np.shape(x0)), jnp.zeros(0)), ((0, 2), (0, 0)))
     none = jnp.zeros((), x0.dtype)
     longer, start = loop, x0
-    for first in (jnp.ones((), x0.dtype) if problem.mode_rates is None else draws(key, none)[1], none):
+    by_chance = problem.mode_rates is not None or problem.intensities is not None
+    for first in (draws(key, none)[1] if by_chance else jnp.ones((), x0.dtype), none):
         longer, start = with_entry(longer, altered(problem, **changed), start, first)
     return dataclasses.replace(longer, modes=count, clock=len(x0), key=key), start
 
@@ -122,7 +133,7 @@ def draws(key: Key | None, n: jax.Array) -> tuple[Array, Array]:
 
 
 def after_changes(loop: Loop, t: jax.Array, y: jax.Array, start: Number) -> jax.Array:
-    """The state and the running cost after the changes of the mode that are due at the time t.
+    """The state and the running cost after the sudden changes that are due at the time t.
 
     Args:
       loop: the loop with its clock.
@@ -131,14 +142,9 @@ def after_changes(loop: Loop, t: jax.Array, y: jax.Array, start: Number) -> jax.
       start: the first time of the path, where discounting starts.
     """
     x, cost, problem = y[:-1], y[-1], loop.problem
-    if problem.mode_rates is not None:
-        rates = problem.mode_rates(*problem.arguments(loop.wrap(x), *loop.players(t, x), t))
-        edges = jnp.cumsum(jnp.maximum(jnp.asarray(rates, x.dtype), 0))
-        count = x[loop.clock + 1] + 1
-        which, clock = draws(loop.key, count)
-        number = 1 + jnp.minimum(jnp.searchsorted(edges, which * edges[-1], side="right"), len(edges) - 1)
-        changed = _in_mode(loop, x, number).at[loop.clock : loop.clock + 2].set(jnp.stack([clock, count]))
-        x = jnp.where(x[loop.clock] <= 0, changed, x)
+    if problem.mode_rates is not None or problem.intensities is not None:
+        x, paid = _after_chance(loop, t, x)
+        cost = cost + loop.discount(t - start) * paid
     if loop.switch is not None:
         for _ in range(loop.modes - 1):  # a cheapest path of changes has at most k − 1 of them
             surplus = loop.switch(t, loop.wrap(x))
@@ -148,6 +154,26 @@ def after_changes(loop: Loop, t: jax.Array, y: jax.Array, start: Number) -> jax.
             cost = cost + jnp.where(due, loop.discount(t - start) * costs[number - 1], 0)
             x = jnp.where(due, _in_mode(loop, x, number), x)
     return jnp.append(x, cost)
+
+
+def _after_chance(loop: Loop, t: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The state after the random change that is due at the time t, if one is, and the cost of the jump."""
+    problem = loop.problem
+    arguments = problem.arguments(loop.wrap(x), *loop.players(t, x), t)
+    edges, count = jnp.cumsum(jnp.maximum(rates_of_changes(problem, arguments, x.dtype), 0)), x[loop.clock + 1] + 1
+    which, clock = draws(loop.key, count)
+    number = jnp.minimum(jnp.searchsorted(edges, which * edges[-1], side="right"), len(edges) - 1)
+    changed, paid = _in_mode(loop, x, number + 1) if loop.modes else x, jnp.zeros((), x.dtype)
+    if problem.intensities is not None:
+        jump = number - (0 if problem.mode_rates is None else loop.modes - 1)
+        first, after = int(loop.modes > 0), jnp.asarray(problem.landings(*arguments), x.dtype)[jnp.maximum(jump, 0)]
+        changed = jnp.where(jump >= 0, x.at[first : first + len(after)].set(after), changed)
+        if problem.jump_costs is not None:
+            costs = jnp.asarray(problem.jump_costs(*arguments), x.dtype)
+            paid = jnp.where(jump >= 0, costs[jnp.maximum(jump, 0)], 0)
+    changed = changed.at[loop.clock : loop.clock + 2].set(jnp.stack([clock, count]))
+    due = x[loop.clock] <= 0
+    return jnp.where(due, changed, x), jnp.where(due, paid, 0)
 
 
 def _in_mode(loop: Loop, x: jax.Array, number: jax.Array) -> jax.Array:
@@ -187,9 +213,9 @@ def _costs_at_nodes(problem: Problem, grid: Grid, dtype: Any, times: Any) -> lis
     return list(jnp.moveaxis(jax.vmap(at)(jnp.asarray(times, dtype)), 1, 0))
 
 
-def without_clock(path: Path, count: int) -> Path:
-    """The path without clock and count; its states begin with the mode."""
-    return dataclasses.replace(path, states=path.states[:, :-2]) if count else path
+def without_clock(path: Path, problem: Problem, count: int) -> Path:
+    """The path without clock and count; its states begin with the mode, if there are modes."""
+    return dataclasses.replace(path, states=path.states[:, :-2]) if has_clock(problem, count) else path
 
 
 def with_modes_apart(path: Path, count: int) -> Path:

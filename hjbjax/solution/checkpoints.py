@@ -115,9 +115,12 @@ class Journal:
         """Bring a part to its recorded state, and return its status if it is complete, otherwise None.
 
         Raises:
-          FileError: the record belongs to another part.
+          FileError: the record belongs to another part, or the file cannot be written.
         """
-        if self._closed or self._at >= len(self.records):
+        if self._closed:
+            return None
+        if self._at >= len(self.records):
+            self.file.try_place()
             return None
         record = self.records[self._at]
         forgotten = record.passing and not record.arrays and self._at + 1 < len(self.records)
@@ -163,6 +166,7 @@ class File:
       target: the file; None in a process that does not write.
       caller: the function that was called, for messages.
       together: True if several processes solve one problem.
+      untested: True if nobody has tested yet that the file can be written.
     """
 
     def __init__(
@@ -174,9 +178,10 @@ class File:
         *,
         caller: str = "solve",
         together: bool = False,
+        untested: bool = False,
     ):
         self.checkpoint, self.question, self.known = checkpoint, dict(question), dict(known)
-        self.target, self.caller, self.together = target, caller, together
+        self.target, self.caller, self.together, self.untested = target, caller, together, untested
         self.journals: dict[str, Journal] = {}
         self.changed = False
         self.failure: str | None = None  # why it could not be written
@@ -196,6 +201,17 @@ class File:
         due = time.monotonic() - self._written >= self.checkpoint.every
         # the state is gathered from all processes, so they must agree
         return bool(agreed(int(due))) if self.together else due
+
+    def try_place(self) -> None:
+        """Test that the file can be written, unless this has been tested.
+
+        Raises:
+          FileError: it cannot be written.
+        """
+        if self.untested and self.target is not None:
+            self.untested = False
+            with _named_after(self.caller):
+                placement.try_place(self.target.path)
 
     def records(self) -> dict[str, Sequence[Record]]:
         """All records by the names of their journals, including lanes that have not begun."""
@@ -314,7 +330,9 @@ def open_checkpoint(
         with _named_after(caller):
             known = (_begin_together if together else _begin)(target, question, resume=resume)
         writes = not together or jax.process_index() == 0
-        file = File(kept, question, known, target if writes else None, caller=caller, together=together)
+        untested = not together and _is_complete(known)
+        own = target if writes else None
+        file = File(kept, question, known, own, caller=caller, together=together, untested=untested)
         try:
             yield file
         except BaseException:
@@ -350,6 +368,8 @@ def _named_after(caller: str) -> Iterator[None]:
 def _begin(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> dict[str, list[Record]]:
     """The records of an earlier run, from the file, which is locked from now on; a new file has no records.
 
+    A complete run writes nothing when it is resumed, so its file may be on a full or read-only disk.
+
     Raises:
       FileExistsError: the file exists, and ``resume`` is false.
       FileError: the file is in use or was made for another problem, or no file can be written there.
@@ -367,8 +387,15 @@ def _begin(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> 
         with contextlib.suppress(FileExistsError):  # another run was faster, which ``take`` reports
             target.write(empty)
             return {}
-    placement.try_place(target.path)
-    return _read(target.path, question)
+    known = _read(target.path, question)
+    if not _is_complete(known):
+        placement.try_place(target.path)
+    return known
+
+
+def _is_complete(known: Mapping[str, Sequence[Record]]) -> bool:
+    """True if all recorded parts are complete; parts that have not begun have no record."""
+    return bool(known) and all(some and all(each.done for each in some) for some in known.values())
 
 
 def _begin_together(target: LockedFile, question: Mapping[str, str], *, resume: bool) -> dict[str, list[Record]]:
@@ -376,6 +403,8 @@ def _begin_together(target: LockedFile, question: Mapping[str, str], *, resume: 
     first, known = jax.process_index() == 0, {}
     with _in_all_processes(target.path):
         known = _begin(target, question, resume=resume) if first else {}
+        if _is_complete(known):  # an error in a later part would occur in the first process only
+            placement.try_place(target.path)
     with _in_all_processes(target.path):
         return known if first or not resume else _read(target.path, question)
 

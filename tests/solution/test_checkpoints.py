@@ -236,13 +236,13 @@ def full(*_):
 
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_place_where_nothing_can_be_written_is_found_before_the_solve(tmp_path, monkeypatch, resume):
+    cut = hjb.solve(posed(), LINE, checkpoint=tmp_path / "old.npz", max_steps=1, throw=False)
+    assert cut.status is hjb.Status.MAX_STEPS
     monkeypatch.setattr(StatesInChunks, "advance", None)
     (tmp_path / "file").write_bytes(b"")
     for name, reason in (("x" * 256, "File name too long"), ("file/run.npz", "there is no folder .*file$")):
         with pytest.raises(hjb.FileError, match=f"^solve: .*cannot be written: {reason}"):
             hjb.solve(posed(), LINE, checkpoint=tmp_path / name, resume=resume)
-    with opened(tmp_path / "old.npz"):
-        pass
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
         with pytest.raises(hjb.FileError, match=r"^solve: .*new\.npz: cannot be written: No space left on device"):
@@ -258,6 +258,30 @@ def test_a_place_where_nothing_can_be_written_is_found_before_the_solve(tmp_path
     with pytest.raises(hjb.FileError, match="run.npz: cannot be written: the current folder has been removed"):
         hjb.solve(posed(), LINE, checkpoint="run.npz", resume=resume)
     assert sorted(os.listdir(tmp_path)) == ["file", "old.npz"]
+
+
+def test_a_complete_run_is_resumed_on_a_full_disk(tmp_path, monkeypatch):
+    """It writes nothing; a part that has not begun must be refused before it computes anything."""
+    path, lanes = tmp_path / "run.npz", tmp_path / "lanes.npz"
+    wanted = hjb.solve(posed(), LINE, checkpoint=path)
+    batch = hjb.solve_batch([posed(), posed(2.0)], LINE, checkpoint=lanes)
+    before = path.read_bytes()
+    with opened(tmp_path / "part.npz") as file:
+        file.journal().leave(Counter(), hjb.Status.CONVERGED)
+    monkeypatch.setattr(os, "fsync", full)
+    found = hjb.solve(posed(), LINE, checkpoint=path, resume=True)
+    alike(found, wanted)
+    assert found.stats["checkpoint"] == "written"
+    resumed = hjb.solve_batch([posed(), posed(2.0)], LINE, checkpoint=lanes, resume=True)
+    for one, other in zip(resumed, batch, strict=True):
+        alike(one, other)
+    with opened(tmp_path / "part.npz", resume=True) as file:
+        journal = file.journal()
+        assert journal.enter(Counter()) is hjb.Status.CONVERGED
+        with pytest.raises(hjb.FileError, match=r"^solve: .*part\.npz: cannot be written: No space left on device"):
+            journal.enter(Counter())
+    assert path.read_bytes() == before
+    assert sorted(os.listdir(tmp_path)) == ["lanes.npz", "part.npz", "run.npz"]
 
 
 def test_a_full_disk_takes_the_checkpoint_and_not_the_answer(tmp_path, monkeypatch):

@@ -298,8 +298,11 @@ def starting_jax() -> Iterator[None]:
     """
     try:
         yield
-    except (ImportError, ValueError, RuntimeError) as error:
-        raise Failure(f"JAX cannot start: {' '.join(str(error).split())}; 'hjbjax doctor' says more") from error
+    except Exception as error:  # even AssertionError without a text, for JAX_PLATFORMS=cuda without CUDA
+        platforms = os.environ.get("JAX_PLATFORMS")
+        bare = type(error).__name__ + (f" with JAX_PLATFORMS={platforms!r}" if platforms else "")
+        reason = " ".join(str(error).split()) or bare
+        raise Failure(f"JAX cannot start: {reason}; 'hjbjax doctor' says more") from error
 
 
 def names_of(table: dict[str, str]) -> Callable[[], Iterable[str]]:

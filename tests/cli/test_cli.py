@@ -179,6 +179,18 @@ def test_jax_without_a_device_is_refused_in_one_line(words, monkeypatch):
     assert refused(run(*words.split()), 2, "JAX cannot start: Unable to initialize backend 'gpu'")
 
 
+@pytest.mark.usefixtures("no_solver", "folder")
+def test_an_error_of_jax_without_a_text_is_named(monkeypatch):
+    """JAX raises a bare AssertionError for JAX_PLATFORMS=cuda if CUDA is missing."""
+
+    def fail():
+        raise AssertionError
+
+    monkeypatch.setattr("jax.devices", fail)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    assert refused(run("list"), 2, "JAX cannot start: AssertionError with JAX_PLATFORMS='cuda'; 'hjbjax doctor' says")
+
+
 @pytest.mark.parametrize("words", [("list",), ("launch", "--", "solve", "bang-bang")])
 def test_a_variable_that_jax_refuses_is_named_in_one_line(words):
     ended = subprocess.run(

@@ -180,6 +180,7 @@ def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
     out = given["out"] or Path(given["name"])
     if not given["dry_run"]:
         processes_of.check_devices(given["devices"], processes)
+        _check_parts(given["name"], given["shape"], given["devices"] or (processes,))
         _check_places(out, *(given[key] for key in ("force", "checkpoint", "resume")))
         with _one_line_error(OSError, 2, "--out: "):
             run_folder.check_writable(out)
@@ -190,6 +191,16 @@ def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
         code = processes_of.start_processes(words, processes, heartbeat, out / FILES[0])
     if code:
         raise SystemExit(code)
+
+
+def _check_parts(name: str, shape: tuple[int, ...] | None, devices: tuple[int, ...]) -> None:
+    """Raise Failure if the nodes cannot be divided over the devices, as far as the shape is known without JAX."""
+    from hjbjax.problem import arguments
+
+    shape = shape or catalogue()[name].parameters["shape"]
+    if shape is not None:
+        with _one_line_error(ValueError, 2):
+            arguments.check_parts(devices, shape, "solve")
 
 
 def _try_checkpoint(checkpoint: Path) -> None:

@@ -315,17 +315,7 @@ def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices:
       ValueError: more axes than the grid has, parts with too few nodes, or a choice that does not support parts.
     """
     mesh = as_mesh(mesh, caller)
-    counts, n = mesh.devices.shape, len(grid_shape)
-    if len(counts) > n:
-        raise ValueError(
-            f"{caller}: mesh has {len(counts)} axes, {counts}, the grid {n}; its i-th divides the grid's i-th"
-        )
-    for axis, (size, count) in enumerate(zip(counts, grid_shape, strict=False)):
-        if size > 1 and count // size < FEWEST:
-            raise ValueError(
-                f"{caller}: mesh divides the {count} points of axis {axis} into {size} parts; wanted at least {FEWEST} "
-                f"points per part, so at most {count // FEWEST} parts"
-            )
+    check_parts(mesh.devices.shape, grid_shape, caller)
     for choice in choices:
         if not choice.in_parts:
             raise ValueError(
@@ -333,6 +323,25 @@ def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices:
                 "hjbjax.discretisation.stencil, and reduces by grid.layout, may set in_parts = True"
             )
     return mesh if mesh.size > 1 else None
+
+
+def check_parts(counts: tuple[int, ...], grid_shape: tuple[int, ...], caller: str) -> None:
+    """Check that the nodes can be divided into these numbers of parts along the axes.
+
+    Raises:
+      ValueError: more numbers than the grid has axes, or parts with too few nodes.
+    """
+    if len(counts) > len(grid_shape):
+        raise ValueError(
+            f"{caller}: mesh has {len(counts)} axes, {counts}, the grid {len(grid_shape)}; its i-th divides the grid's "
+            "i-th"
+        )
+    for axis, (size, count) in enumerate(zip(counts, grid_shape, strict=False)):
+        if size > 1 and count // size < FEWEST:
+            raise ValueError(
+                f"{caller}: mesh divides the {count} points of axis {axis} into {size} parts; wanted at least {FEWEST} "
+                f"points per part, so at most {count // FEWEST} parts"
+            )
 
 
 def as_mesh(mesh: object, caller: str) -> Mesh:

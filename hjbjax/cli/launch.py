@@ -245,7 +245,8 @@ def start_processes(words: Sequence[str], processes: int, heartbeat: int, result
             # less than the heartbeat, so that the others can save their work even if the stopped one continues
             outcome = children.run_children(commands, EXPLAINED, GREETING, heartbeat / 2, FAREWELL.encode(), arrival)
     except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
-        raise Failure(f"launch: {processes} processes could not be started: {error}", DIED) from error
+        why = getattr(error, "strerror", None) or error
+        raise Failure(f"launch: {processes} processes could not be started: {why}", DIED) from error
     code = _verdict(outcome, _way_on(words, processes, result))
     if outcome.unwritten is not None:
         raise outcome.unwritten

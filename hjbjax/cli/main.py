@@ -380,8 +380,7 @@ def _write(
             run_folder.publish(staging, out, made, force)
             published = bool(made)
     except OSError as error:
-        # the hidden folder no longer exists when the user reads this
-        reason = str(error).replace(f"{staging}{os.sep}", f"{out}{os.sep}")
+        reason = run_folder.reason_of(error, staging, out)
         if published:
             raise Failure(f"{reason}; written: {', '.join(text_of(out / file) for file in made)}", 5) from error
         kept = run_folder.rescue(out, lambda folder: run_folder.copy(solution, staging, folder))
@@ -438,7 +437,8 @@ def _publish_page(cards: "list[Card]", staging: Path, out: Path, force: bool) ->
         pages.publish_page(cards, staging, out, force)
     except OSError as error:
         kept = run_folder.rescue(out, lambda folder: pages.write_page(cards, folder))
-        raise Failure(f"the page could not be written: {error}; {kept}", 5) from error
+        reason = run_folder.reason_of(error, staging, out)
+        raise Failure(f"the page could not be written: {reason}; {kept}", 5) from error
 
 
 @main.command(short_help="Check versions and devices.")

@@ -88,18 +88,19 @@ def staging(out: Path) -> Iterator[Path]:
     placement.remove_leftovers(place)
     folder = place / placement.hidden_name(out.name)
     try:
-        try:
-            folder.mkdir(mode=0o700)  # private until it is complete
-            trial = folder / FILES[0]
-            trial.write_bytes(bytes(placement.BLOCK))  # a full disk may still accept folders
-            trial.unlink()
-            missing = whole.relative_to(place).parts
-            folder.joinpath(*missing).mkdir(parents=True, exist_ok=True)  # detects names that are too long now
-        except OSError as error:
-            raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
-        if missing:
-            shutil.rmtree(folder / missing[0])
-        with placement.claim(folder):
+        with contextlib.ExitStack() as claimed:
+            try:
+                folder.mkdir(mode=0o700)  # private until it is complete
+                trial = folder / FILES[0]
+                trial.write_bytes(bytes(placement.BLOCK))  # a full disk may still accept folders
+                trial.unlink()
+                missing = whole.relative_to(place).parts
+                folder.joinpath(*missing).mkdir(parents=True, exist_ok=True)  # detects names that are too long now
+                if missing:
+                    shutil.rmtree(folder / missing[0])
+                claimed.enter_context(placement.claim(folder))
+            except OSError as error:
+                raise OSError(f"{out} cannot be written: {error.strerror}; give another folder") from error
             yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)  # the sweep of the next command removes the rest
@@ -130,6 +131,14 @@ def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -
             placement.place(folder / file, out / file, force)
         else:
             (out / file).unlink(missing_ok=True)
+
+
+def reason_of(error: OSError, staging: Path, out: Path) -> str:
+    """The file and the reason of an error, without the hidden folder, which is gone when the user reads the message."""
+    file = error.filename2 or error.filename  # of a move the destination
+    reason = error.strerror or str(error)
+    named = f"{file}: {reason}" if file else reason
+    return named.replace(f"{staging}{os.sep}", f"{out}{os.sep}")
 
 
 def copy(solution: Solution, staging: Path, folder: Path) -> None:

@@ -288,6 +288,31 @@ def test_what_was_computed_is_never_thrown_away(quick, folder, monkeypatch, harm
         assert "smooth" in file.read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("function", ["replace", "rmdir", "open"])
+@pytest.mark.parametrize("words", [["solve", "smooth", "--force"], ["gallery", "--only", "smooth", "--force"]])
+def test_an_error_of_the_disk_names_a_place_of_the_user_once(quick, folder, monkeypatch, function, words):
+    """Not the hidden folder, which no longer exists, and a file that cannot be moved not twice."""
+    call, made = getattr(os, function), folder / "out" / ("index.html" if words[0] == "gallery" else "solution.npz")
+    if function == "replace":
+        made.parent.mkdir()
+        made.write_text("old")
+
+    def fail(path, *more, **options):
+        if placement.OWN.search(os.fspath(path)):
+            raise OSError(
+                5, "Input/output error", os.fspath(path), None, *map(os.fspath, more[: function == "replace"])
+            )
+        return call(path, *more, **options)
+
+    monkeypatch.setattr(os, function, fail)
+    result = run(*words, "--out", "out")
+    assert (result.exit_code, result.stderr.count("\n")) == (5 if function == "replace" else 2, 1)
+    place = f"out/{made.name}: " if function == "replace" else "--out: out cannot be written: "
+    assert f"{place}Input/output error; " in result.stderr
+    assert "Errno" not in result.stderr
+    assert ".tmp-" not in result.stderr
+
+
 def test_pictures_are_kept_too(folder, monkeypatch):
     grid = hjbjax.Grid([0.0], [1.0], (3,))
     (folder / "staging").mkdir()

@@ -189,7 +189,7 @@ def _check_shapes(generator: Any, h: Any, sensor: Sensor, states: int) -> None:
         )
     if callable(h):
         return
-    if np.ndim(h) not in (1, 2) or len(np.asarray(h)) != states:
+    if np.ndim(h) not in (1, 2) or np.shape(h)[0] != states:
         raise ValueError(
             f"WonhamFilter: h has shape {np.shape(h)}, wanted ({states},) or ({states}, p): one row per state"
         )

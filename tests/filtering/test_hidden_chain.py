@@ -41,6 +41,12 @@ def test_transition_matrices_are_those_of_scipy_and_never_negative(seed):
     np.testing.assert_allclose(ours.sum(axis=1), 1, atol=1e-14)
 
 
+@jax.jit
+def _step(generator, h, prior, noise, dy, dt):
+    observer = WonhamFilter(generator, h, prior, measurement_noise=noise)
+    return observer.update(observer.initial(), jnp.zeros(0), dy, dt)
+
+
 @given(seed=SEEDS)
 @settings(max_examples=20)
 def test_a_step_is_bayes_rule(seed):
@@ -56,8 +62,7 @@ def test_a_step_is_bayes_rule(seed):
     for before, within, after in itertools.product(range(3), repeat=3):
         wanted[after] += prior[before] * half[before, within] * likelihood[within] * half[within, after]
     with jax.enable_x64(True):
-        observer = WonhamFilter(generator, h, prior, measurement_noise=noise)
-        found = observer.update(observer.initial(), jnp.zeros(0), dy, dt)
+        found = _step(generator, h, prior, noise, dy, dt)
     np.testing.assert_allclose(found, wanted / wanted.sum(), rtol=1e-9, atol=1e-12)
 
 

@@ -39,7 +39,7 @@ def grid_filter():
 def test_a_prediction_is_the_law_of_the_plant():
     with jax.enable_x64(True):
         mean, variance = moved(1.0, 0.2, 0.8)
-        state = kalman().update(kalman().initial(), NONE, None, 0.8)
+        state = jax.jit(lambda s: kalman().update(s, NONE, None, 0.8))(kalman().initial())
         np.testing.assert_allclose([state.mean[0], state.covariance[0, 0]], [mean, variance], rtol=1e-12)
         observer = grid_filter()
         state = jax.jit(lambda s: observer.update(s, NONE, None, 0.8))(observer.initial())
@@ -110,10 +110,14 @@ def test_equal_sensors_count_by_their_mean(r, x64):
     """Two sensors of noise r are one of noise r/√2; with r = 1e-9 their covariance is singular up to rounding."""
     pair, alone = kalman(twice, r), kalman(identity, r / np.sqrt(2))
     with jax.enable_x64(x64):
-        states, dt = [pair.initial(), alone.initial()], 0.01
+        states, dt = (pair.initial(), alone.initial()), 0.01
+
+        @jax.jit
+        def update(states, y):
+            return pair.update(states[0], NONE, jnp.stack([y, y]) * dt, dt), alone.update(states[1], NONE, y[None] * dt, dt)
+
         for y in (0.9, 0.7, 0.8, 0.85):
-            states[0] = pair.update(states[0], NONE, np.array([y, y]) * dt, dt)
-            states[1] = alone.update(states[1], NONE, np.array([y]) * dt, dt)
+            states = update(states, jnp.asarray(y))
         both, one = (np.array([each.mean[0], each.covariance[0, 0]]) for each in states)
     assert np.all(np.isfinite(both))
     tolerance = 1e-6 if x64 else 5e-3

@@ -108,7 +108,8 @@ def test_the_timed_sweep_is_that_of_the_exported_chain(shape):
     with jax.enable_x64(True):
         on = cast(Discretisation(problem, grid, sweep.SCHEME, np.float64), np.float64)
         outflow = np.asarray(jax.jit(fastest_rate)(on))
-        found = sweep.sweep(on.problem, on.grid, jnp.asarray(value), jnp.asarray(outflow + problem.discount))
+        pace = jnp.asarray(outflow + problem.discount)
+        found = jax.jit(sweep.sweep)(on.problem, on.grid, jnp.asarray(value), pace)
     np.testing.assert_allclose(found, value + rate / (outflow + problem.discount), rtol=0, atol=1e-12)
 
 

@@ -93,7 +93,7 @@ for number in range(count):
         time.sleep(wait)
         pressed.append(time.perf_counter())
         os.kill(os.getpid(), signal.SIGINT)
-    hand = threading.Thread(target=press, args=(random.choice([0.1, 1.0, 4.0, 12.0]) * random.random(),))
+    hand = threading.Thread(target=press, args=(random.choice([0.1, 1.0, 3.0, 6.0]) * random.random(),))
     row = {"task": task.__name__}
     hand.start()
     try:

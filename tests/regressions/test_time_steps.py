@@ -100,8 +100,9 @@ def test_what_is_cut_is_counted_in_all_steps(method):
         lambda t, x, u: 0.1 * u + jnp.where((t > 0.3) & (t < 0.6), 2.0, 0.0), lambda t, x, u: x @ x, UNIT,
         time_dependent=True,
     )  # fmt: skip
-    assert hjb.march(pulled, LINE, 1.0, times=[0.0, 1.0], method=method).cut.tolist() == [[[0, 1]], [[0, 0]]]
-    kept = hjb.march(pulled, LINE, 1.0, times=[0.0, 0.2, 0.8, 1.0], method=method)
+    line = hjb.Grid([-1.0], [1.0], (41,))
+    assert hjb.march(pulled, line, 1.0, times=[0.0, 1.0], method=method).cut.tolist() == [[[0, 1]], [[0, 0]]]
+    kept = hjb.march(pulled, line, 1.0, times=[0.0, 0.2, 0.8, 1.0], method=method)
     assert kept.cut[:, 0, 1].tolist() == [0, 1, 0, 0]
 
 

@@ -1,7 +1,5 @@
 """Paths of solved and marched problems cost what V promises, whatever is paid on the way and at the end."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,23 +17,22 @@ KINDS = ["running", "discounted", "stopping", "target", "stopping and target", "
          "reach", "avoid", "reach and avoid", "moving price", "reach in a game", "discounted reach"]  # fmt: skip
 
 
-def bumps(parameters, x):
-    """A smooth function of the state."""
-    a, b, c = parameters
-    return a * jnp.cos(2 * x[0] + b) + c * x[0] ** 2
+def bumps(a, b, c):
+    """A smooth function of the state. Its numbers are in a closure, so that other numbers share its programs."""
+    return lambda x: a * jnp.cos(2 * x[0] + b) + c * x[0] ** 2
 
 
 def posed(kind, p):
     """A problem on a line of one of the kinds, whose numbers p are random, shape (12,)."""
-    wind = functools.partial(bumps, (0.3 * p[0], 3 * p[1], 0.0))
-    price = functools.partial(bumps, (0.5, 3 * p[2], 0.2))
+    wind = bumps(0.3 * p[0], 3 * p[1], 0.0)
+    price = bumps(0.5, 3 * p[2], 0.2)
     distance = lambda x: jnp.sqrt((x[0] - 0.5 * p[3]) ** 2 + 1e-3) - 0.4  # noqa: E731
     obstacle = lambda x: jnp.sqrt((x[0] - 0.5 * p[4] + 1.2) ** 2 + 1e-3) - 0.3  # noqa: E731
     drift = lambda x, u: u + wind(x)  # noqa: E731
     pushed = lambda x, u, d: u + 0.4 * d + wind(x)  # noqa: E731
     cost = lambda x, u: 0.5 + 0.3 * x[0] ** 2 + (0.5 + 0.4 * p[5]) * u @ u  # noqa: E731
     worst = lambda x, u, d: cost(x, u) - (2 + p[6]) * d @ d  # noqa: E731
-    final = functools.partial(bumps, (0.4, 3 * p[7], 0.3))
+    final = bumps(0.4, 3 * p[7], 0.3)
     beta, home = 0.5 + 0.4 * p[8], lambda x: 1.2 + 0.2 * p[9] - x[0]
     if kind == "moving price":
         moved = lambda t, x: price(x - 0.5 * t)  # noqa: E731

@@ -29,10 +29,11 @@ class Put:
         return np.where(s <= self.boundary, self.strike - s, out)
 
     def problem(self):
-        top = self.strike * 4 * (1 - 1e-9)  # the price at the upper end is prescribed
+        strike, rate, volatility = self.strike, self.rate, self.volatility  # other numbers share the programs
+        top = strike * 4 * (1 - 1e-9)  # the price at the upper end is prescribed
         return hjb.Problem(
-            lambda x, u: self.rate * x, noise=lambda x, u: self.volatility * x, discount=self.rate,
-            stopping_reward=lambda x: jnp.maximum(self.strike - x[0], 0.0), target=lambda x: top - x[0],
+            lambda x, u: rate * x, noise=lambda x, u: volatility * x, discount=rate,
+            stopping_reward=lambda x: jnp.maximum(strike - x[0], 0.0), target=lambda x: top - x[0],
             exit_reward=float(self.price(4 * self.strike)),
         )  # fmt: skip
 

@@ -51,13 +51,18 @@ def test_the_mass_matrix_is_symmetric_and_positive(links):
     rng = np.random.default_rng(links)
     arm = zoo.Manipulator(links=links, lengths=rng.uniform(0.5, 2, links), masses=rng.uniform(0.5, 2, links))
     q, w, tau = (jnp.asarray(rng.uniform(-3, 3, links)) for _ in range(3))
-    matrix = np.asarray(arm.mass_matrix(q))
+
+    @jax.jit
+    def evaluate(q, w, tau):
+        energy, rates = arm.kinetic_energy(q, w), arm.drift(jnp.concatenate([q, w]), tau)
+        return arm.mass_matrix(q), energy, rates, arm.coriolis(q, w) + arm.gravity(q)
+
+    matrix, energy, rates, forces = map(np.asarray, evaluate(q, w, tau))
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
     assert np.min(np.linalg.eigvalsh(matrix)) > 0
-    assert float(arm.kinetic_energy(q, w)) == pytest.approx(0.5 * w @ matrix @ w)
+    assert float(energy) == pytest.approx(0.5 * w @ matrix @ w)
     # The drift solves (5.5).
-    rates = arm.drift(jnp.concatenate([q, w]), tau)
-    np.testing.assert_allclose(matrix @ rates[links:] + arm.coriolis(q, w) + arm.gravity(q), tau, atol=1e-9)
+    np.testing.assert_allclose(matrix @ rates[links:] + forces, tau, atol=1e-9)
     np.testing.assert_array_equal(rates[:links], w)
 
 

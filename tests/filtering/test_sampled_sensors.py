@@ -114,9 +114,8 @@ def test_equal_sensors_count_by_their_mean(r, x64):
 
         @jax.jit
         def update(states, y):
-            return pair.update(states[0], NONE, jnp.stack([y, y]) * dt, dt), alone.update(
-                states[1], NONE, y[None] * dt, dt
-            )
+            both = pair.update(states[0], NONE, jnp.stack([y, y]) * dt, dt)
+            return both, alone.update(states[1], NONE, y[None] * dt, dt)
 
         for y in (0.9, 0.7, 0.8, 0.85):
             states = update(states, jnp.asarray(y))

@@ -210,11 +210,11 @@ def decide(
         if not 0 < allowed < 1:
             raise ValueError(f"got tolerance = {tolerance!r}, wanted a number between 0 and 1")
         try:
-            found = _compiled(derive, tuple(static.items()))(cast(functions, np.float64), state, allowed)
+            found = compiled(derive, tuple(static.items()))(cast(functions, np.float64), state, allowed)
         except jax.errors.JAXTypeError as error:
             # for example an ``if`` on a state, or a NumPy function of a state
             raise ValueError("a field cannot be traced: use jnp.where instead of if, jnp instead of numpy") from error
-        answer = _compiled(judge, ())(found, state, allowed)
+        answer = compiled(judge, ())(found, state, allowed)
         # a field may close over a traced value although field and state are concrete; the answer then stays traced
         answer = jax.tree.map(lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf), answer)
     numbers = [leaf for leaf in jax.tree.leaves((found, answer)) if not is_traced(leaf)]
@@ -226,7 +226,8 @@ def decide(
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled(rule: Callable[..., T], static: tuple[tuple[str, int | bool], ...]) -> Callable[..., T]:
+def compiled(rule: Callable[..., T], static: tuple[tuple[str, int | bool], ...]) -> Callable[..., T]:
+    """A rule as one program, with its static arguments."""
     # jit caches programs by the identity of the function, and a new partial in every call would compile again
     return jax.jit(functools.partial(rule, **dict(static)))
 

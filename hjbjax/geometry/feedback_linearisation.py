@@ -27,6 +27,7 @@ from hjbjax.geometry.brackets import (
     as_half_widths,
     as_pytree,
     as_state,
+    compiled,
     decide,
     near,
     output_derivatives,
@@ -185,8 +186,8 @@ class Linearisation:
             def rule(depth: int) -> RelativeDegree:
                 tolerance = np.asarray(rounding_of_terms(origin.dtype))
                 functions = (self.fields, self.output, np.full(states, 0.1))
-                found = _first_effects(functions, origin, tolerance, samples=16, depth=depth)
-                return _relative_degree(found, origin, tolerance)
+                derive = compiled(_first_effects, (("samples", 16), ("depth", depth)))
+                return compiled(_relative_degree, ())(derive(functions, origin, tolerance), origin, tolerance)
 
             return _degrees_or_refuse(_deepen(rule, states), "the origin")
 

@@ -28,7 +28,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.jumps import Jump
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball, Box, Finite
+from hjbjax.problem.sets import Ball, Box, Finite, Simplex
 from hjbjax.problem.stretching import Sinh
 from hjbjax.semi_lagrangian.scheme import SemiLagrangian
 from hjbjax.solution.checkpoints import Checkpoint
@@ -70,6 +70,7 @@ __all__ = [
     "Problem",
     "Robin",
     "SemiLagrangian",
+    "Simplex",
     "Sinh",
     "Solution",
     "SolveError",

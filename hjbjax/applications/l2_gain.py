@@ -19,7 +19,7 @@ from hjbjax.problem.mode_axis import refuse_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, front_door, numbers
 from hjbjax.problem.rewards import refuse_rewards
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, refuse_unbounded
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex, refuse_unbounded
 from hjbjax.problem.types import Array, Number, Numbers
 from hjbjax.solution.solution import Solution
 
@@ -148,6 +148,8 @@ def saturation(solution: Solution, problem: Problem, *, inner: float = 0.5) -> S
     # the points of a finite set have no bound; every worst case is one of them
     if isinstance(admissible, Finite):
         raise ValueError(f"saturation: the disturbances are {len(admissible.points)} points; wanted a Box or a Ball")
+    if isinstance(admissible, Simplex):  # its disturbances have a sum, not a size
+        raise ValueError(f"saturation: got disturbances in {admissible!r}; wanted a Box or a Ball")
     refuse_unbounded(admissible, "saturation", "the worst case is compared with them")
     if not 0 < inner <= 1:
         raise ValueError(f"saturation: got inner = {inner!r}; wanted a share of the box in (0, 1]")

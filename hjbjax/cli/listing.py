@@ -10,7 +10,7 @@ import numpy as np
 from hjbjax import zoo
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Simplex
 from hjbjax.zoo.entry import Entry
 
 WIDTH = 100  # columns; narrower terminals wrap the lines
@@ -72,6 +72,9 @@ def _actions(admissible: AdmissibleSet | None, names: tuple[str, ...], units: tu
         return "; ".join(f"{name} from {lo:.4g} to {hi:.4g}" for name, lo, hi in bounds)
     if isinstance(admissible, Ball):
         return f"({', '.join(called)}) of length {float(admissible.radius):.4g} at most"
+    if isinstance(admissible, Simplex):
+        word = "of sum at most" if admissible.at_most else "of sum"
+        return f"({', '.join(called)}) ≥ 0 {word} {float(admissible.total):.4g}"
     return f"({', '.join(called)}), one of a finite number"
 
 

@@ -33,7 +33,7 @@ from hjbjax.plotting.style import NARROW, save_figure
 from hjbjax.problem import streams
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball, Box
+from hjbjax.problem.sets import Ball, Box, Simplex
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, Status
 from hjbjax.zoo.ingredients import Exact, Feedback
@@ -228,13 +228,14 @@ def axes() -> "Axes":
 def is_bang_bang(problem: Problem, solution: Solution) -> bool:
     """True if the feedback jumps: it is enumerated, or 90 % of its entries are at a bound."""
     box = problem.controls
-    if solution.discrete or not isinstance(box, Box):
+    if solution.discrete or not isinstance(box, (Box, Simplex)):
         return solution.discrete
     # 90 %, because nodes at rest and on the switching curve may have any value
-    if box.unbounded:
+    if isinstance(box, Box) and box.unbounded:
         return False
-    policy, near = _finite_controls(solution), 1e-6 * (box.hi - box.lo)
-    return policy.size > 0 and bool(np.mean((policy <= box.lo + near) | (policy >= box.hi - near)) > 0.9)
+    lo, hi = (0.0, box.total) if isinstance(box, Simplex) else (box.lo, box.hi)
+    policy, near = _finite_controls(solution), 1e-6 * (hi - lo)
+    return policy.size > 0 and bool(np.mean((policy <= lo + near) | (policy >= hi - near)) > 0.9)
 
 
 def _is_direction(problem: Problem, solution: Solution) -> bool:

@@ -1,11 +1,13 @@
 """The two players: their sets, and how the Hamiltonian depends on them, read from the problem's functions.
 
 The optimum over a player's actions is exact if the drift is affine in them, the noise independent of them, and the cost
-quadratic, over a box or a ball of any dimension. Inputs that drive a common component, or whose product enters the
+quadratic, over a box, a ball or a simplex of any dimension. Inputs that drive a common component, or whose product enters the
 cost, form a group. The method depends on the group:
 
     one input of a box, or two without a product    all ends, kinks and stationary points are tried (``piecewise``)
     a ball, one component per input at most         all combinations of pieces are tried (``ball``)
+    a simplex that drives no component              the multiplier of the sum (``simplex``)
+    two inputs of a simplex                         as one input of a box, since the other is the rest of the total
     any other                                       convex quadratic programs (``quadratic_program``)
 
 The last method requires a cost that is convex for a minimiser and concave for a maximiser. This depends on numbers that
@@ -25,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex
 from hjbjax.tracing import dependence
 from hjbjax.tracing.operations import Operations
 
@@ -50,7 +52,7 @@ class Player:
       exact: True if the optimum is found exactly rather than by samples.
       driven: for every input the drift components that it drives.
       groups: the inputs, grouped by shared drift components and by products in the cost; H is a sum over the groups.
-        All inputs of a ball are one group if they are a program.
+        All inputs of a ball are one group if they are a program, and all inputs of a simplex always.
       cells: for every group the number of pieces that the Hamiltonian may have.
       programs: for every group, True if its optimum is found by quadratic programs.
       curved: for every input, True if the cost may contain its square.
@@ -173,7 +175,7 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     # without bounds there are no ends, and the fastest action is known only once it has been chosen
     at_ends = (affine and not getattr(admissible, "unbounded", False)) or isinstance(admissible, (Finite, type(None)))
     suits = affine and found.landing.free_of(inputs)
-    suits &= cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball))
+    suits &= cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball, Simplex))
     products = frozenset(tuple(j - inputs.start for j in pair) for pair in cost.products_in(inputs))
     groups = _groups(driven, products)
     if isinstance(admissible, Ball):
@@ -182,6 +184,12 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
         together = not (apart and few and admissible.dim <= 3)
         groups = (tuple(range(len(driven))),) if together else groups
         programs = (together,) * len(groups)
+    elif isinstance(admissible, Simplex):
+        groups = (tuple(range(len(driven))),)
+        pieces = branches ** len(shared(driven, groups[0]))
+        programs = (admissible.freedom > 0 and pieces > (CELLS[1] if admissible.freedom == 1 else 1 - bool(products)),)
+        if admissible.freedom == 0:  # the only action
+            suits = at_ends = True
     else:
         joined = {j for pair in products for j in pair}
         programs = tuple(

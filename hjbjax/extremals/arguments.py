@@ -11,7 +11,7 @@ from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial
-from hjbjax.problem.sets import refuse_unbounded
+from hjbjax.problem.sets import Simplex, refuse_unbounded
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.solution import Solution
 
@@ -40,6 +40,11 @@ def check_problem(problem: object, tol: float, max_nodes: int) -> None:
         )
     if problem.controls is None:
         raise ValueError("pontryagin: got a problem without controls, wanted a Box, a Ball or a Finite to choose from")
+    if isinstance(problem.controls, Simplex):
+        raise ValueError(
+            f"pontryagin: got controls in {problem.controls!r}, wanted a Box, a Ball or a Finite: the conditions have no\n"
+            "multiplier for the sum. Solve the problem on a grid, or enumerate the controls with Simplex.grid(num)"
+        )
     refuse_unbounded(problem.controls, "pontryagin", "the guess starts from samples between them")
     if not (np.ndim(tol) == 0 and 0 < tol < 1):
         raise ValueError(f"pontryagin: got tol = {tol!r}, wanted a number between 0 and 1")

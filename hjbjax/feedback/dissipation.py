@@ -29,7 +29,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced, pytree_dataclass
 from hjbjax.problem.rewards import refuse_rewards
-from hjbjax.problem.sets import Ball, Box, Finite, refuse_unbounded
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex, refuse_unbounded
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Key, Number, Numbers, State
 from hjbjax.solution.solution import Solution
@@ -177,7 +177,7 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple
     # equally spaced in the logarithm: each decade down to WEAKEST gets its share, and the last covers the whole set
     strength = np.geomspace(WEAKEST, 1.0, random) if random > 1 else np.ones(random)
     # the point of the set nearest to 0, about which the set is scaled
-    least = np.clip(0.0, admissible.lo, admissible.hi) if isinstance(admissible, Box) else np.zeros(admissible.dim)
+    least = _nearest_zero(admissible)
     away = np.zeros((0, POINTS, admissible.dim))
     if count:
         assert not isinstance(admissible, Finite)  # refused together with random > 0
@@ -189,10 +189,22 @@ def _lanes(problem: Problem, starts: np.ndarray, random: int, key: Key) -> tuple
     return lanes, ["worst case"] * len(starts) + ["random"] * count
 
 
-def _sample(admissible: Box | Ball, key: Key, shape: tuple[int, ...]) -> jax.Array:
+def _nearest_zero(admissible: AdmissibleSet) -> np.ndarray:
+    """The admissible disturbance nearest to zero, shape (l,)."""
+    if isinstance(admissible, Box):
+        return np.clip(0.0, admissible.lo, admissible.hi)
+    if isinstance(admissible, Simplex) and not admissible.at_most:
+        return np.full(admissible.dim, np.asarray(admissible.total) / admissible.dim)
+    return np.zeros(admissible.dim)
+
+
+def _sample(admissible: Box | Ball | Simplex, key: Key, shape: tuple[int, ...]) -> jax.Array:
     """Independent points, uniform in a set, shape (*shape, l)."""
     if isinstance(admissible, Box):
         return jax.random.uniform(key, (*shape, admissible.dim), minval=admissible.lo, maxval=admissible.hi)
+    if isinstance(admissible, Simplex):  # with at_most the rest of the total is one more part
+        parts = jax.random.dirichlet(key, jnp.ones(admissible.freedom + 1), shape)
+        return admissible.total * parts[..., : admissible.dim]
     return admissible.radius * jax.random.ball(key, admissible.dim, shape=shape)
 
 
@@ -273,7 +285,7 @@ def _check(
     if random and isinstance(problem.disturbances, Finite):
         raise ValueError(
             f"dissipation: the disturbances are {len(problem.disturbances.points)} points, and random ones would run "
-            "between them; wanted a Box or a Ball, or random=0"
+            "between them; wanted a Box, a Ball or a Simplex, or random=0"
         )
     for signal in signals:
         if not callable(signal):

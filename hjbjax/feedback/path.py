@@ -9,7 +9,7 @@ import numpy as np
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, holds
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Simplex, holds
 from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array
 from hjbjax.solution.status import warn
@@ -201,5 +201,5 @@ def truncate(
 
 
 def _are_inadmissible(controls: AdmissibleSet | None, applied: Array) -> bool:
-    """True if a control is outside a box or a ball by more than rounding; finite sets are not checked."""
-    return isinstance(controls, (Box, Ball)) and not np.all(holds(controls, applied))
+    """True if a control is outside its set by more than rounding; finite sets are not checked."""
+    return isinstance(controls, (Box, Ball, Simplex)) and not np.all(holds(controls, applied))

@@ -1,4 +1,4 @@
-"""The exact optimum of the discrete Hamiltonian over a box or a ball: its pieces, read from a problem's functions.
+"""The exact optimum of the discrete Hamiltonian over a box, a ball or a simplex: its pieces, read from a problem's functions.
 
 The drift is affine in the player's inputs and the cost quadratic (see ``players``), so derivatives at zero give all
 coefficients. From them ``piecewise``, ``ball`` and ``quadratic_program`` find the optimum of each group of inputs.
@@ -6,6 +6,7 @@ coefficients. From them ``piecewise``, ``ball`` and ``quadratic_program`` find t
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,12 +24,15 @@ from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.piecewise import Kinked, piecewise_input, piecewise_pair
 from hjbjax.hamiltonian.quadratic_program import Program
 from hjbjax.hamiltonian.search import Action
+from hjbjax.hamiltonian.simplex import least_in_simplex, project
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.sets import Ball, Box, refuse_unbounded
+from hjbjax.problem.sets import Ball, Box, Simplex, refuse_unbounded
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Verdict
 from hjbjax.tracing import components
+
+ROUNDING = 16  # units of rounding of a total, below which an input that is the rest of the total counts as zero
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,11 +72,15 @@ class _Part:
 
 
 def exact_optimum(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> Action:
-    """One player's optimum over a box or a ball against the other's action; ``join(mine)`` makes the pair (u, d)."""
+    """One player's optimum over its set against the other's action; ``join(mine)`` makes the pair (u, d)."""
+    if isinstance(player.admissible, Simplex) and player.admissible.freedom == 0:
+        return [jnp.asarray(player.admissible.total, hamiltonian.on.dtype)]
     part = _part(hamiltonian, player, join)
     action: Action = [jnp.zeros((), hamiltonian.on.dtype)] * len(player.driven)
     if isinstance(player.admissible, Ball) and not any(player.programs):
         return _in_ball(part)
+    if isinstance(player.admissible, Simplex):
+        return _in_simplex(part)
     for group, program in zip(player.groups, player.programs, strict=True):
         found = _programmed(part, group)[0] if program else _in_box(part, group)
         for j, u in zip(group, found, strict=True):
@@ -86,15 +94,15 @@ def optimum_error(hamiltonian: DiscreteHamiltonian, player: Player, join: Callab
     The bound follows from convexity for quadratic programs, and is zero up to rounding if the cost is convex for this
     player. All other optima are exact formulas.
     """
-    part = _part(hamiltonian, player, join)
-    groups = [group for group, program in zip(player.groups, player.programs, strict=True) if program]
+    part = _in_free_inputs(_part(hamiltonian, player, join))
+    groups = [group for group, program in zip(part.player.groups, player.programs, strict=True) if program]
     bounds = (_programmed(part, group)[1] for group in groups)
     return sum(bounds, start=jnp.zeros(hamiltonian.value.shape, hamiltonian.on.dtype))
 
 
 def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> _Part:
     """The coefficients of a player's part of H."""
-    assert isinstance(player.admissible, (Box, Ball))
+    assert isinstance(player.admissible, (Box, Ball, Simplex))
     on, count = hamiltonian.on, player.admissible.dim
     # at zero even if zero is not admissible: the offset and slopes there determine an affine drift
     u, d = join([jnp.zeros((), on.dtype)] * count)
@@ -139,14 +147,77 @@ def _in_box(part: _Part, group: Sequence[int]) -> Action:
     return piecewise_pair(player.sign, lo, hi, slope, bend, pieces, curved=curved)
 
 
+def _in_simplex(part: _Part) -> Action:
+    """The optimum over a simplex."""
+    admissible, player, (group,) = part.player.admissible, part.player, part.player.groups
+    assert isinstance(admissible, Simplex)
+    if admissible.freedom > 1 and not player.programs[0]:
+        linear, square = ([player.sign * each for each in entries] for entries in _separable(part))
+        return list(least_in_simplex(admissible, linear, square))
+    if not admissible.at_most:
+        found = _in_simplex(_in_free_inputs(part))
+        rest = admissible.total - sum(found)
+        # rounding of the sum, for which the last input must not be negative
+        return [*found, jnp.where(rest > ROUNDING * jnp.finfo(rest.dtype).eps * admissible.total, rest, 0)]
+    if player.programs[0]:
+        return _programmed(part, group)[0]
+    (linear,), (square,) = _separable(part)
+    pieces = [part.gain(i, group) for i in player.driven[0]]
+    zero, total = (jnp.asarray(end, part.hamiltonian.on.dtype) for end in (0, admissible.total))
+    return [piecewise_input(player.sign, zero, total, linear, square, pieces, curved=player.curved[0])]
+
+
+def _separable(part: _Part) -> tuple[list[PerNode], list[PerNode]]:
+    """l_j and Q_jj of all inputs."""
+    return list(part.linear), [part.square(j) for j in range(len(part.linear))]
+
+
+def _in_free_inputs(part: _Part) -> _Part:
+    """The part of H in all inputs but the last one of a simplex, which is the rest of the total; other sets unchanged.
+
+    The first inputs are nonnegative and have at most this total, so they belong to a simplex of another kind.
+    """
+    player, admissible = part.player, part.player.admissible
+    if not isinstance(admissible, Simplex) or admissible.at_most:
+        return part
+    total, count = jnp.asarray(admissible.total, part.hamiltonian.on.dtype), admissible.freedom
+    last, bends = part.slopes[count], [[_bend(part, j, k) for k in range(count + 1)] for j in range(count + 1)]
+    quadratic = {}
+    for j, k in itertools.combinations_with_replacement(range(count), 2):
+        bend = bends[j][k] - bends[j][count] - bends[count][k] + bends[count][count]
+        quadratic[j, k] = bend / 2 if j == k else bend
+    curved = bool(part.quadratic)
+    driven = tuple(shared(player.driven, (j, count)) for j in range(count))
+    reduced = dataclasses.replace(
+        player, admissible=Simplex(count, total, at_most=True), driven=driven, groups=(tuple(range(count)),),
+        curved=(curved,) * count, products=frozenset(itertools.combinations(range(count), 2) if curved else ()),
+    )  # fmt: skip
+    return _Part(
+        part.hamiltonian,
+        reduced,
+        # at u = (0, ..., 0, total)
+        [
+            part.linear[j] - part.linear[count] + total * (bends[j][count] - bends[count][count])
+            for j in range(count)
+        ],
+        quadratic if curved else {},
+        [offset + total * slope for offset, slope in zip(part.offsets, last, strict=True)],
+        [[slope - other for slope, other in zip(part.slopes[j], last, strict=True)] for j in range(count)],
+        part.noise,
+    )  # fmt: skip
+
+
 def _programmed(part: _Part, group: Sequence[int]) -> tuple[Action, jax.Array]:
     """The optimum over a group of inputs as a quadratic program, and a bound on its error."""
     admissible = part.player.admissible
-    assert isinstance(admissible, (Box, Ball))
+    assert isinstance(admissible, (Box, Ball, Simplex))
     program, axes = _program(part, group, [part.gain(i, group) for i in shared(part.player.driven, group)])
     v, distance = quadratic_program.minimise_quadratic(program, axes, ball=isinstance(admissible, Ball))
     if isinstance(admissible, Ball):
         return [admissible.radius * each for each in v], distance
+    if isinstance(admissible, Simplex):
+        inside = [jnp.where(each == 1, 1, jnp.where(each == -1, 0, (1 + each) / 2)) for each in v]
+        return list(project(admissible, [admissible.total * each for each in inside])), distance
     action = []
     for j, each in zip(group, v, strict=True):
         lo, hi = admissible.lo[j], admissible.hi[j]
@@ -155,8 +226,10 @@ def _programmed(part: _Part, group: Sequence[int]) -> tuple[Action, jax.Array]:
     return action, distance
 
 
-def _ends(admissible: Box | Ball, group: Sequence[int]) -> tuple[list[Any], list[Any]]:
+def _ends(admissible: Box | Ball | Simplex, group: Sequence[int]) -> tuple[list[Any], list[Any]]:
     """The middle and half the width of each input's range; a ball is the unit ball times its radius."""
+    if isinstance(admissible, Simplex):
+        return [admissible.total / 2] * len(group), [admissible.total / 2] * len(group)
     if isinstance(admissible, Ball):
         return [0.0] * len(group), [admissible.radius] * len(group)
     pairs = [(admissible.lo[j], admissible.hi[j]) for j in group]
@@ -166,7 +239,7 @@ def _ends(admissible: Box | Ball, group: Sequence[int]) -> tuple[list[Any], list
 def _program(part: _Part, group: Sequence[int], gains: Sequence[Kinked]) -> tuple[Program, tuple[int, ...]]:
     """The coefficients of a group's part of H in unit variables, u = middle + half v, and each kink's component."""
     admissible, sign = part.player.admissible, part.player.sign
-    assert isinstance(admissible, (Box, Ball))
+    assert isinstance(admissible, (Box, Ball, Simplex))
     middle, half = _ends(admissible, group)
     bend = [[sign * _bend(part, j, k) for k in group] for j in group]
     slope = [sign * part.linear[j] + _dot(row, middle) for j, row in zip(group, bend, strict=True)]
@@ -182,6 +255,12 @@ def _program(part: _Part, group: Sequence[int], gains: Sequence[Kinked]) -> tupl
             jumps.append(sign * jump)
             sides.append(side)
             axes.append(axis)
+    if isinstance(admissible, Simplex):  # Σ u ≤ total as a kink that is a constraint, which belongs to no component
+        rows.append([1.0] * len(group))
+        offsets.append(len(group) - 2.0)
+        jumps.append(jnp.inf)
+        sides.append(1)
+        axes.append(-1)
 
     shape, dtype = part.hamiltonian.value.shape, part.hamiltonian.on.dtype
 
@@ -273,6 +352,8 @@ def may_miss(on: Discretisation) -> Verdict | bool:
 def _needs_convexity(player: Player) -> bool:
     """True if a player's optimum over a ball or by quadratic programs has a quadratic cost."""
     quadratic = any(player.curved) or bool(player.products)
+    if isinstance(player.admissible, Simplex):
+        return player.exact and quadratic and (any(player.programs) or player.admissible.freedom > 1)
     return player.exact and quadratic and (any(player.programs) or isinstance(player.admissible, Ball))
 
 
@@ -291,6 +372,10 @@ def _is_concave(on: Discretisation) -> Verdict:
                 [quadratic.get((min(j, k), max(j, k)), 0.0) * player.sign * (1 + (j == k)) for k in group]
                 for j in group
             ]
+            if program and isinstance(player.admissible, Simplex) and not player.admissible.at_most:
+                # convex along the simplex, as a function of all inputs but the last one
+                edge = bend[-1]
+                bend = [[b - row[-1] - e + edge[-1] for b, e in zip(row[:-1], edge, strict=False)] for row in bend[:-1]]
             rows = [jnp.stack([jnp.broadcast_to(entry, on.grid.shape) for entry in row]) for row in bend]
             found |= ~jnp.all(quadratic_program.is_convex(jnp.stack(rows)))
     return found

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 
 from hjbjax.discretisation.players import SAMPLES, Player
-from hjbjax.hamiltonian import exact, search
+from hjbjax.hamiltonian import exact, search, simplex
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.piecewise import inverse_root
 from hjbjax.hamiltonian.search import UNROLL, Action, best_of, enumerate_actions, refine
 from hjbjax.problem import sets
 from hjbjax.problem.pytree import altered, tie
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex
 from hjbjax.problem.types import Field
 
 INNER = 8  # actions of the player who moves second to write out, inside the search of the first player
@@ -148,8 +148,10 @@ def _sampled(
     return refine(objective, best, sets.spacing(player.admissible, SAMPLES), project, player.sign, weight=weight)
 
 
-def _projection(admissible: Box | Ball) -> Callable[[Action], Action]:
+def _projection(admissible: Box | Ball | Simplex) -> Callable[[Action], Action]:
     """The projection of an action onto its set, because a step of the search may leave the set."""
+    if isinstance(admissible, Simplex):
+        return lambda action: simplex.project(admissible, action)
     if isinstance(admissible, Box):
         return lambda action: [jnp.clip(u, admissible.lo[j], admissible.hi[j]) for j, u in enumerate(action)]
 
@@ -166,5 +168,7 @@ def _any_action(admissible: AdmissibleSet | None) -> Action:
         return []
     if isinstance(admissible, Ball):
         return [jnp.zeros(())] * admissible.dim
+    if isinstance(admissible, Simplex):
+        return [jnp.asarray(admissible.total / admissible.dim)] * admissible.dim
     first = admissible.lo if isinstance(admissible, Box) else admissible.points[0]
     return [first[j] for j in range(admissible.dim)]

@@ -8,6 +8,7 @@ Unlike on a grid there is no upwinding, so H has no kinks in u. The dependence o
     Finite                            enumerated
     Box, separable quadratic in u     the stationary point clipped, input by input; an end if H is affine or concave
     Ball, separable quadratic         −(2C + μ)⁻¹b with the multiplier μ ≥ 0 of the radius, by Newton's method
+    Simplex, separable and convex     max(−l − τ, 0)/(2q) with the multiplier τ of the sum
     anything else                     samples, a pattern search, and Newton steps in the inputs that are not at a bound
 
 If H is affine in an input of a box, u* jumps between the ends: that input is ``jumping``. Between enumerated controls
@@ -25,8 +26,10 @@ import numpy as np
 
 from hjbjax.hamiltonian.ball import least_in_ball
 from hjbjax.hamiltonian.search import Action, enumerate_actions, refine
+from hjbjax.hamiltonian.simplex import least_in_simplex
+from hjbjax.hamiltonian.simplex import project as onto_simplex
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, finite_ends, samples, spacing
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex, finite_ends, samples, spacing
 from hjbjax.problem.types import Control, Costate, DType, Number, Scalar, State
 from hjbjax.tracing import dependence
 
@@ -151,6 +154,12 @@ def least(
     if isinstance(admissible, Box):
         lo, hi = (jnp.asarray(bound, dtype) for bound in finite_ends(admissible, dtype))
         return _in_box(lo, hi, slope, square)
+    if isinstance(admissible, Simplex):
+        return jax.lax.cond(
+            jnp.all(square >= 0),
+            lambda: jnp.stack(least_in_simplex(admissible, list(slope), list(square))),
+            lambda: _searched(admissible, energy, dtype),  # a concave cost has local minima at all vertices
+        )
     return jnp.stack(least_in_ball(jnp.asarray(admissible.radius, dtype), list(slope), list(square)))
 
 
@@ -168,10 +177,11 @@ def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], ja
 
     The last Newton step provides the derivative of the implicit function, which the search does not have.
     """
-    assert isinstance(admissible, (Box, Ball))
-    count = admissible.dim
+    assert isinstance(admissible, (Box, Ball, Simplex))
 
     def project(action: Action) -> Action:
+        if isinstance(admissible, Simplex):
+            return onto_simplex(admissible, action)
         u = jnp.stack(action)
         if isinstance(admissible, Ball):
             # 1e-300 keeps the quotient finite at the centre, which does not move
@@ -186,16 +196,31 @@ def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], ja
     # each step starts from a number without a derivative, so only the last step has one
     for _ in range(3):
         u = jax.lax.stop_gradient(u)
-        gradient, bend = jax.grad(energy)(u), jax.hessian(energy)(u)
-        # an input at its bound stays there: its row becomes a row of the identity with a zero right-hand side
-        if isinstance(admissible, Ball):
-            free = jnp.full(count, jnp.linalg.norm(u) < admissible.radius * (1 - 1e-6))
-        else:
-            room = 1e-6 * (admissible.hi - admissible.lo)
-            free = (u > admissible.lo + room) & (u < admissible.hi - room)
-        matrix = jnp.where(free[:, None] & free[None, :], bend, jnp.eye(count, dtype=dtype))
+        if isinstance(admissible, Simplex):  # the projection moves with the total, and Newton's step starts from it
+            u = jnp.stack(project(list(u)))
+        matrix, slope = _of_free_inputs(admissible, u, jax.grad(energy)(u), jax.hessian(energy)(u))
         # away from a minimum Newton's step may lead uphill; then the result of the search is kept
         convex = jnp.all(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) > 0)
-        step = jnp.linalg.solve(matrix, jnp.where(free, gradient, 0))
+        step = jnp.linalg.solve(matrix, slope)
         u = jnp.where(convex, jnp.stack(project(list(u - step))), u)
     return u
+
+
+def _of_free_inputs(
+    admissible: Box | Ball | Simplex, u: jax.Array, gradient: jax.Array, bend: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The matrix and the gradient of Newton's step in the directions that no bound blocks."""
+    eye = jnp.eye(admissible.dim, dtype=u.dtype)
+    if isinstance(admissible, Simplex):
+        some = jax.lax.stop_gradient(u > 1e-6 * admissible.total).astype(u.dtype)
+        full = jax.lax.stop_gradient(jnp.sum(u) >= admissible.total * (1 - 1e-6)) | (not admissible.at_most)
+        # the projection onto these directions, which keep the sum if it is the total
+        along = jnp.diag(some) - jnp.where(full, jnp.outer(some, some) / jnp.maximum(jnp.sum(some), 1), 0)
+        return along @ bend @ along + eye - along, along @ gradient
+    # an input at its bound stays there: its row becomes a row of the identity with a zero right-hand side
+    if isinstance(admissible, Ball):
+        free = jnp.full(admissible.dim, jnp.linalg.norm(u) < admissible.radius * (1 - 1e-6))
+    else:
+        room = 1e-6 * (admissible.hi - admissible.lo)
+        free = (u > admissible.lo + room) & (u < admissible.hi - room)
+    return jnp.where(free[:, None] & free[None, :], bend, eye), jnp.where(free, gradient, 0)

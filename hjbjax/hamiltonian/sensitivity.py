@@ -8,8 +8,9 @@ that are free at a node satisfy ∂H/∂z = 0, so that
 
 for both players at once. An input is not free if an end of its box or a kink of H holds it. At an end it moves with the
 end. At a kink of the upwinding, f = 0 or with central differences |f| = a/h, it moves so that f stays at the kink. On
-the rim of a ball, |z| = R, there is also a multiplier λ with ∂H/∂z + λ z = 0. Actions from a finite set do not move,
-nor does an action on which H does not depend to second order.
+the rim of a ball, |z| = R, there is also a multiplier λ with ∂H/∂z + λ z = 0. The largest input of a simplex is the rest
+of the total, so the others are exchanged for it. Actions from a finite set do not move, nor does an action on which H
+does not depend to second order.
 """
 
 import dataclasses
@@ -27,7 +28,7 @@ from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem import sets
-from hjbjax.problem.sets import Ball, Box
+from hjbjax.problem.sets import Ball, Box, Simplex
 from hjbjax.problem.types import Field
 
 # A minimum found by comparing values is off by about the square root of their rounding error. This number
@@ -40,10 +41,18 @@ Row: TypeAlias = tuple[dict[int, Any], Any]  # of a linear system at every node:
 
 @dataclasses.dataclass(frozen=True)
 class Input:
-    """One input of a player with a continuous set of actions."""
+    """One input of a player with a continuous set of actions.
+
+    Attributes:
+      player: the player.
+      index: the number of the input.
+      pivots: for every input of a simplex, the nodes where it is the rest of the total. A step of another input there
+        is an exchange for the pivot, and a step of the pivot changes the sum.
+    """
 
     player: Player
     index: int
+    pivots: tuple[Any, ...] = ()
 
     @property
     def mine(self) -> bool:
@@ -57,7 +66,10 @@ class Input:
     def moved(self, u: Action, d: Action, step: Any) -> tuple[Action, Action]:
         """Both actions after a step of this input."""
         u, d = list(u), list(d)
-        (u if self.mine else d)[self.index] += step
+        action = u if self.mine else d
+        for k, pivot in enumerate(self.pivots):
+            action[k] -= jnp.where(pivot & ~self.pivots[self.index], step, 0)
+        action[self.index] += step
         return u, d
 
     def slope(self, function: Callable[[Action, Action], Field], u: Action, d: Action) -> Field:
@@ -101,7 +113,7 @@ def actions(on: Discretisation, value: Field, lost: jax.Array | None, u: Action,
     control, disturbance = players.control, players.disturbance
     # for a coupled min max each optimum moves with the other, so solve for both at once
     if disturbance.admissible is not None and not players.decoupled:
-        return _implicit(at, [*_inputs(control), *_inputs(disturbance)])
+        return _implicit(at, [*_inputs(at, control), *_inputs(at, disturbance)])
     return _alone(at, control, lambda mine: (mine, d))[0], _alone(at, disturbance, lambda mine: (u, mine))[1]
 
 
@@ -109,14 +121,29 @@ def _alone(at: Optimum, player: Player, join: Callable) -> tuple[Action, Action]
     """Both actions with the derivatives of one player, whose optimum does not depend on the other's action."""
     if player.exact:
         return join(optimum.best_response(at.moving, player, join)[1])
-    return _implicit(at, _inputs(player))
+    return _implicit(at, _inputs(at, player))
 
 
-def _inputs(player: Player) -> list[Input]:
+def _inputs(at: Optimum, player: Player) -> list[Input]:
     """The inputs that can move by small steps."""
-    if isinstance(player.admissible, (Box, Ball)):
-        return [Input(player, j) for j in range(player.admissible.dim)]
+    if isinstance(player.admissible, (Box, Ball, Simplex)):
+        pivots = _pivots(player, at) if isinstance(player.admissible, Simplex) else ()
+        return [Input(player, j, pivots) for j in range(player.admissible.dim)]
     return []
+
+
+def _pivots(player: Player, at: Optimum) -> tuple[Any, ...]:
+    """For every input of a simplex, the nodes where it is the largest one and the sum is the total, bool."""
+    simplex, entries = player.admissible, at.u if player.sign > 0 else at.d
+    assert isinstance(simplex, Simplex)
+    total, left = jax.lax.stop_gradient(simplex.total), jnp.ones((), bool)
+    if simplex.at_most:
+        left = sum(entries) >= total - Input(player, 0).close()
+    largest, found = functools.reduce(jnp.maximum, entries), []
+    for entry in entries:  # the first of equal ones
+        found.append(left & (entry == largest))
+        left = left & ~found[-1]
+    return tuple(found)
 
 
 def _implicit(at: Optimum, inputs: Sequence[Input]) -> tuple[Action, Action]:
@@ -166,8 +193,11 @@ def _rows(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], bends: 
 
 
 def _end(each: Input, entry: Any) -> tuple[Any, Any]:
-    """The nodes at which an end of its box holds an input, and the end."""
+    """The nodes at which an end of its box, or zero in a simplex, holds an input, and the end."""
     admissible = each.player.admissible
+    if isinstance(admissible, Simplex):
+        pivot = each.pivots[each.index]
+        return pivot | (entry <= each.close()), jnp.where(pivot, admissible.total, 0)  # the pivot moves with the total
     if not isinstance(admissible, Box):
         return jnp.zeros(jnp.shape(entry), bool), jnp.zeros_like(entry)
     lo, hi, close = admissible.lo[each.index], admissible.hi[each.index], each.close()

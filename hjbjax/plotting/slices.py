@@ -17,7 +17,7 @@ from hjbjax.feedback.payments import is_tube
 from hjbjax.plotting.scales import place_text
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
-from hjbjax.problem.sets import Ball, Box
+from hjbjax.problem.sets import Ball, Box, Simplex
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.tracing import checks
@@ -168,6 +168,8 @@ def span_of(solution: "Solution", input: int) -> float:
     if isinstance(controls, Box):
         span = float(controls.hi[input] - controls.lo[input])
         return span if np.isfinite(span) else 0.0
+    if isinstance(controls, Simplex):
+        return float(controls.total)
     return 2 * float(controls.radius) if isinstance(controls, Ball) else 0.0
 
 

@@ -20,7 +20,7 @@ from hjbjax.problem.jumps import Jump
 from hjbjax.problem.labels import COST, REWARD, Labels
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
-from hjbjax.problem.sets import AdmissibleSet, AnyControl, Ball, Box, Finite
+from hjbjax.problem.sets import AdmissibleSet, AnyControl, Ball, Box, Finite, Simplex
 from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
 
 PAYMENTS = {  # the payments of a problem with rewards, and the same payments as costs
@@ -297,11 +297,13 @@ def _check_sets(controls: object, disturbances: object) -> None:
     for name, admissible in (("controls", controls), ("disturbances", disturbances)):
         if name == "controls" and callable(admissible):  # bounds that depend on the state
             continue
-        if admissible is not None and not isinstance(admissible, (Box, Ball, Finite, AnyControl)):
+        if admissible is not None and not isinstance(admissible, (Box, Ball, Simplex, Finite, AnyControl)):
             cure = ""
             if isinstance(admissible, (tuple, list)) and len(admissible) == 2:
                 cure = f": hjb.Box({admissible[0]!r}, {admissible[1]!r})"
-            raise TypeError(f"Problem.{name}: got {admissible!r}, wanted a Box, a Ball, a Finite or None{cure}")
+            raise TypeError(
+                f"Problem.{name}: got {admissible!r}, wanted a Box, a Ball, a Simplex, a Finite or None{cure}"
+            )
 
 
 def _rate(discount: object) -> Any:

@@ -1,11 +1,12 @@
 """Admissible sets of controls and disturbances.
 
-``Box`` and ``Ball`` are continuous sets and are minimised over as such; ``Finite`` is enumerated. The numbers in a set
-are leaves, so a wider box does not recompile.
+``Box``, ``Ball`` and ``Simplex`` are continuous sets and are minimised over as such; ``Finite`` is enumerated. The
+numbers in a set are leaves, so a wider box does not recompile.
 """
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -131,6 +132,59 @@ class Ball:
         object.__setattr__(self, "dim", int(self.dim))
 
 
+@pytree_dataclass(static=("dim", "at_most"))
+class Simplex:
+    """The simplex u_i ≥ 0, u_1 + ... + u_dim = total: shares of a portfolio, or one effort divided among tasks.
+
+    With ``at_most=True`` the sum may be smaller, u_1 + ... + u_dim ≤ total: the rest is cash, or idle.
+
+    Args:
+      dim: the number of inputs m.
+      total: the sum, positive, in the units of the inputs, which must all be the same.
+      at_most: True if the sum may be smaller than the total.
+
+    Raises:
+      ValueError: the total is not one positive finite number, or the dimension is not a positive integer.
+      TypeError: ``at_most`` is not a bool.
+
+    Example:
+      >>> Simplex(2).grid(3).points.tolist()
+      [[0.0, 1.0], [0.5, 0.5], [1.0, 0.0]]
+    """
+
+    dim: int
+    total: Any = 1.0
+    at_most: bool = False
+
+    def __post_init__(self) -> None:
+        if not _is_count(self.dim):
+            raise ValueError(f"Simplex: got dim = {self.dim!r}, wanted a positive integer: the number of inputs")
+        if not isinstance(self.at_most, (bool, np.bool_)):
+            raise TypeError(f"Simplex: got at_most = {self.at_most!r}, wanted True or False; the sum is total=")
+        total = _finite_numbers(self.total, "Simplex.total")
+        if np.ndim(total) != 0:
+            raise ValueError(f"Simplex: got a total of shape {np.shape(total)}, wanted one number")
+        if isinstance(total, np.ndarray) and total <= 0:
+            raise ValueError(f"Simplex: got total = {float(total):g}, wanted a positive number: no inputs are left")
+        object.__setattr__(self, "dim", int(self.dim))
+        object.__setattr__(self, "total", total)
+        object.__setattr__(self, "at_most", bool(self.at_most))
+
+    @property
+    def freedom(self) -> int:
+        """The number of inputs that can be chosen independently: the others follow from the sum."""
+        return self.dim if self.at_most else self.dim - 1
+
+    def grid(self, num: int) -> "Finite":
+        """The simplex sampled with ``num`` equally spaced values per input, including 0 and the total, as a finite set.
+
+        The set has (num + m − 2)!/((num − 1)! (m − 1)!) points for m inputs, and with ``at_most`` those for m + 1.
+        """
+        if not _is_count(num) or int(num) < 2:
+            raise ValueError(f"Simplex.grid: got {num!r}, wanted an integer of at least 2: the values per input")
+        return Finite(known(self.total) * _lattice(self, int(num) - 1))
+
+
 @pytree_dataclass()
 class Finite:
     """A finite set, enumerated in order; the first of several equally good points wins.
@@ -169,20 +223,23 @@ class AnyControl:
     dim: int
 
 
-AdmissibleSet: TypeAlias = Box | Ball | Finite
+AdmissibleSet: TypeAlias = Box | Ball | Simplex | Finite
 
 
 def samples(admissible: AdmissibleSet, budget: int) -> Array:
     """Representative points of a set, shape (K, m) with K about ``budget``; all points of a finite set.
 
     A box has an odd number of values per input, so that its ends and its middle are included. A ball has its centre and
-    directions on two spheres, at equal angles in the plane and along axes and diagonals in higher dimensions.
+    directions on two spheres, at equal angles in the plane and along axes and diagonals in higher dimensions. A simplex
+    has a lattice that includes its vertices, and its centre.
     """
     if isinstance(admissible, Finite):
         return admissible.points
     if isinstance(admissible, Box):
         per_input = _values_an_input(admissible, budget)
         return _spread(admissible, per_input) if admissible.unbounded else admissible.grid(per_input).points
+    if isinstance(admissible, Simplex):
+        return known(admissible.total) * _unit_simplex(admissible, budget)
     unit = _unit_ball(admissible.dim, budget)
     return known(admissible.radius) * unit
 
@@ -219,9 +276,12 @@ def finite_ends(box: Box, dtype: DType) -> tuple[Any, Any]:
     return lo, hi
 
 
-def at_bounds(box: Box, u: np.ndarray) -> np.ndarray:
+def at_bounds(admissible: Box | Simplex, u: np.ndarray) -> np.ndarray:
     """The number of controls, rows of u (K, m), at the lower and at the upper bound of each input, shape (m, 2)."""
-    lo, hi = np.asarray(box.lo), np.asarray(box.hi)
+    if isinstance(admissible, Simplex):
+        lo, hi = np.zeros(admissible.dim), np.full(admissible.dim, np.asarray(admissible.total))
+    else:
+        lo, hi = np.asarray(admissible.lo), np.asarray(admissible.hi)
     slack = SLACK * _size(lo, hi)
     return np.stack([np.sum(u <= lo + slack, axis=0), np.sum(u >= hi - slack, axis=0)], axis=-1)
 
@@ -256,6 +316,38 @@ def _unit_ball(dim: int, budget: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, dim)), 0.5 * sphere, sphere])
 
 
+def _unit_simplex(simplex: Simplex, budget: int) -> np.ndarray:
+    """At most ``budget`` points of a lattice on the simplex with total 1, and its centre, shape (K, m).
+
+    The first and the last point are vertices.
+    """
+    points, parts = _lattice(simplex, _intervals(simplex, budget)), simplex.freedom + 1
+    centre = np.full((1, simplex.dim), 1 / parts)
+    if np.any(np.all(np.abs(points - centre) < SLACK, axis=1)):
+        return points
+    middle = len(points) // 2
+    return np.concatenate([points[:middle], centre, points[middle:]])
+
+
+def _intervals(simplex: Simplex, budget: int) -> int:
+    """The largest number of intervals per edge with at most ``budget`` lattice points, at least one."""
+    rest = simplex.freedom
+    intervals = 1
+    while rest and math.comb(intervals + 1 + rest, rest) <= budget:
+        intervals += 1
+    return intervals
+
+
+def _lattice(simplex: Simplex, intervals: int) -> np.ndarray:
+    """The points of the simplex with total 1 whose inputs are multiples of 1/intervals, in order, shape (K, m)."""
+    # stars and bars: the gaps between ``rest`` bars among ``intervals`` stars
+    rest = simplex.freedom
+    rows = list(itertools.combinations(range(intervals + rest), rest))
+    bars = np.array(rows, np.int64).reshape(len(rows), rest)
+    edges = np.concatenate([np.full((len(bars), 1), -1), bars, np.full((len(bars), 1), intervals + rest)], axis=1)
+    return (np.diff(edges, axis=1) - 1)[:, : simplex.dim] / intervals
+
+
 def holds(admissible: AdmissibleSet, u: Array) -> np.ndarray:
     """True for each control (..., m) inside a set of known numbers, up to rounding in float32; shape (...)."""
     if isinstance(admissible, Box):
@@ -264,6 +356,10 @@ def holds(admissible: AdmissibleSet, u: Array) -> np.ndarray:
         return np.all((u >= lo - slack) & (u <= hi + slack), axis=-1)
     if isinstance(admissible, Ball):
         return np.linalg.norm(u, axis=-1) <= np.asarray(admissible.radius) * (1 + SLACK)
+    if isinstance(admissible, Simplex):
+        total = np.asarray(admissible.total)
+        off = np.sum(u, axis=-1) - total
+        return np.all(u >= -SLACK * total, axis=-1) & ((off if admissible.at_most else np.abs(off)) <= SLACK * total)
     points = np.asarray(admissible.points)
     slack = SLACK * np.max(np.abs(points), axis=0)
     return np.any(np.all(np.abs(u[..., None, :] - points) <= slack, axis=-1), axis=-1)
@@ -275,6 +371,8 @@ def extremes(admissible: AdmissibleSet) -> Array:
         return admissible.points
     if isinstance(admissible, Box):
         return _spread(admissible, 2) if admissible.unbounded else admissible.grid(2).points
+    if isinstance(admissible, Simplex):
+        return known(admissible.total) * _lattice(admissible, 1)
     # the 2^m corners of the cube around the ball, because no polytope inside the ball contains it
     return admissible.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=admissible.dim)))
 
@@ -294,6 +392,8 @@ def spacing(admissible: AdmissibleSet, budget: int) -> list[Number]:
     """The distance between neighbouring ``samples``, one number per input."""
     if isinstance(admissible, Ball):
         return [admissible.radius / 2] * admissible.dim  # from the centre to the half-way sphere, and on to the rim
+    if isinstance(admissible, Simplex):
+        return [admissible.total / _intervals(admissible, budget)] * admissible.dim
     assert isinstance(admissible, Box)
     per_input = _values_an_input(admissible, budget)
     if admissible.unbounded:

@@ -27,7 +27,7 @@ from hjbjax.problem import arguments, sets
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import is_traced, known, pytree_dataclass
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex
 from hjbjax.problem.types import DType
 from hjbjax.tracing import dependence
 
@@ -48,7 +48,7 @@ class SemiLagrangian(Scheme, Paths):
     where its l is zero, also between nodes. A target of a single node is reached through interpolation.
 
     The minimum is over these arcs only. The actions of a ``Finite`` set are its elements. If drift and cost are affine
-    in the control, the actions are the corners of a box, or about ``actions`` directions on the boundary of a ball.
+    in the control, the actions are the corners of a box or a simplex, or about ``actions`` directions on the boundary of a ball.
     Otherwise they are about ``actions`` samples, and the distance between samples limits the accuracy of the control.
     The policy is the action of the best arc.
 
@@ -139,8 +139,8 @@ def _bang_bang(problem: Problem, n: int, dtype: DType) -> bool:
 
 
 def _rim(admissible: AdmissibleSet, budget: int) -> Any:
-    """The corners of a box, directions on a sphere, or all elements of a finite set."""
-    if isinstance(admissible, Box):
+    """The corners of a box or a simplex, directions on a sphere, or all elements of a finite set."""
+    if isinstance(admissible, (Box, Simplex)):
         return sets.extremes(admissible)
     if isinstance(admissible, Finite):
         return admissible.points

@@ -18,7 +18,7 @@ from hjbjax.iteration.isaacs import isaacs_gap
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST, Labels
 from hjbjax.problem.pytree import is_traced
-from hjbjax.problem.sets import Box, at_bounds
+from hjbjax.problem.sets import Box, Simplex, at_bounds
 from hjbjax.problem.types import Field, Nodes, Scalar
 from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, question
@@ -102,7 +102,7 @@ def active_bounds(on: Discretisation, policy: np.ndarray | None, when: str = "")
     A control with an affine cost is at a bound nearly everywhere, so it is left out.
     """
     box, found = on.problem.controls, []
-    if policy is None or not isinstance(box, Box):
+    if policy is None or not isinstance(box, (Box, Simplex)):
         return {}
     counts = at_bounds(box, policy.reshape(-1, box.dim))
     names = on.problem.control_names or [f"u{j + 1}" for j in range(box.dim)]

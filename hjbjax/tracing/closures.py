@@ -298,7 +298,7 @@ def _shapes(problem: Problem, name: str, n: int) -> list[tuple[int, ...]]:
     if callable(problem.controls):
         raise ValueError(
             "Problem.controls: got bounds that depend on the state, which this function does not take; wanted a fixed "
-            "set, such as hjb.Box, hjb.Ball or hjb.Finite"
+            "set, such as hjb.Box, hjb.Ball, hjb.Simplex or hjb.Finite"
         )
     sizes = [0 if admissible is None else admissible.dim for admissible in (problem.controls, problem.disturbances)]
     shapes = {"x": (n,), "u": (sizes[0],), "d": (sizes[1],), "t": ()}

@@ -15,7 +15,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.players import Player
 from hjbjax.problem import sets
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Simplex
 from hjbjax.problem.types import Array, Mask
 from hjbjax.tracing import components
 
@@ -46,6 +46,8 @@ def with_kinks(on: Discretisation, player: Player, action: list) -> list[list]:
     found = [action]
     if not _knows_kinks(on, player) or len(player.driven) == 1:
         return found
+    if isinstance(player.admissible, Simplex):
+        return found + _exchanged(on, player, action)
     for j, driven in enumerate(player.driven):
         # every input multiplies the count by one plus the number of components it drives: six inputs with one each give
         # 64
@@ -66,6 +68,8 @@ def beside_samples(on: Discretisation, player: Player) -> list[list]:
     """
     if not _knows_kinks(on, player):
         return []
+    if isinstance(player.admissible, Simplex):
+        return [] if player.admissible.freedom == 0 else _on_edges(on, player.admissible, player)
     found = _of_a_ball(on, player.admissible, player) if isinstance(player.admissible, Ball) else []
     if len(player.driven) > 1:
         return found
@@ -103,6 +107,34 @@ def _of_a_ball(on: Discretisation, ball: Ball, player: Player) -> list[list]:
     return found
 
 
+def _on_edges(on: Discretisation, simplex: Simplex, player: Player) -> list[list]:
+    """The actions on the edges of a simplex at which a component vanishes; at other nodes a vertex."""
+    found: list[list] = []
+    for vertex in np.asarray(sets.extremes(simplex)):
+        found += _exchanged(on, player, [jnp.asarray(entry, on.dtype) for entry in vertex])[: COMBINATIONS - len(found)]
+    return found
+
+
+def _exchanged(on: Discretisation, player: Player, action: list) -> list[list]:
+    """An action of a simplex with one input exchanged for another, or for the rest of the total, where f_i vanishes."""
+    simplex, count, found = player.admissible, len(player.driven), []
+    assert isinstance(simplex, Simplex)
+    offset = on.drift(action)
+    arguments = on.problem.arguments(on.coordinates(), action, None, 0.0)
+    slopes = [
+        components.components(player.derivative(on.problem, on.problem.drift, j), *arguments, dtype=on.dtype)
+        for j in range(count)
+    ]
+    pairs = [*itertools.combinations(range(count), 2), *((j, count) for j in range(count) if simplex.at_most)]
+    for j, k in pairs:  # the last k is the rest of the total
+        for i in sorted({*player.driven[j], *(player.driven[k] if k < count else ())}):
+            slope = slopes[j][i] - (slopes[k][i] if k < count else 0)
+            step = jnp.where(slope != 0, -offset[i] / jnp.where(slope != 0, slope, 1), 0)
+            moved = [u + step * (index == j) - step * (index == k) for index, u in enumerate(action)]
+            found.append(_where(_contains(simplex, moved), moved, action))
+    return found[:COMBINATIONS]
+
+
 def _kinks(on: Discretisation, player: Player, base: list, j: int) -> list[jax.Array]:
     """The values of input j, each (*grid), at which a component that it drives vanishes, given the other inputs.
 
@@ -130,7 +162,10 @@ def _contains(admissible: AdmissibleSet | None, action: list) -> Mask:
     """The nodes at which an action is in its box or ball."""
     if isinstance(admissible, Ball):
         return sum(u * u for u in action) <= admissible.radius**2
-    assert isinstance(admissible, Box)  # kinks are used only for exact minima, over a box or a ball
+    if isinstance(admissible, Simplex):
+        room = admissible.total * (1 + sets.SLACK) - sum(action)
+        return functools.reduce(jnp.logical_and, (u >= 0 for u in action), room >= 0)
+    assert isinstance(admissible, Box)  # kinks are used only for exact minima, over these sets
     return functools.reduce(
         jnp.logical_and, ((u >= admissible.lo[j]) & (u <= admissible.hi[j]) for j, u in enumerate(action))
     )

@@ -196,14 +196,32 @@ def _searched(admissible: AdmissibleSet | None, energy: Callable[[jax.Array], ja
     # each step starts from a number without a derivative, so only the last step has one
     for _ in range(3):
         u = jax.lax.stop_gradient(u)
-        if isinstance(admissible, Simplex):  # the projection moves with the total, and Newton's step starts from it
-            u = jnp.stack(project(list(u)))
+        if isinstance(admissible, Simplex):
+            u = _with_total(admissible, u)
         matrix, slope = _of_free_inputs(admissible, u, jax.grad(energy)(u), jax.hessian(energy)(u))
         # away from a minimum Newton's step may lead uphill; then the result of the search is kept
         convex = jnp.all(jnp.linalg.eigvalsh(jax.lax.stop_gradient(matrix)) > 0)
         step = jnp.linalg.solve(matrix, slope)
-        u = jnp.where(convex, jnp.stack(project(list(u - step))), u)
+        moved = jnp.stack(project(list(u - step)))
+        if isinstance(admissible, Simplex):  # on its boundary the projection has a kink: zeros stay, others move on
+            change = u - step - jax.lax.stop_gradient(u - step)
+            moved = jax.lax.stop_gradient(moved)
+            moved = moved + jnp.where(moved > 0, change, 0)
+        u = jnp.where(convex, moved, u)
     return u
+
+
+def _with_total(simplex: Simplex, u: jax.Array) -> jax.Array:
+    """The same numbers, with a derivative by which the positive inputs share a change of the total."""
+    some, full = _positive(simplex, u)
+    change = simplex.total - jax.lax.stop_gradient(simplex.total)
+    return u + jnp.where(full, some * change / jnp.maximum(jnp.sum(some), 1), 0)
+
+
+def _positive(simplex: Simplex, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """1 for the positive inputs and 0 for the others, and True if the sum is the total."""
+    known, total = jax.lax.stop_gradient((u, simplex.total))
+    return (known > 1e-6 * total).astype(u.dtype), (jnp.sum(known) >= total * (1 - 1e-6)) | (not simplex.at_most)
 
 
 def _of_free_inputs(
@@ -212,8 +230,7 @@ def _of_free_inputs(
     """The matrix and the gradient of Newton's step in the directions that no bound blocks."""
     eye = jnp.eye(admissible.dim, dtype=u.dtype)
     if isinstance(admissible, Simplex):
-        some = jax.lax.stop_gradient(u > 1e-6 * admissible.total).astype(u.dtype)
-        full = jax.lax.stop_gradient(jnp.sum(u) >= admissible.total * (1 - 1e-6)) | (not admissible.at_most)
+        some, full = _positive(admissible, u)
         # the projection onto these directions, which keep the sum if it is the total
         along = jnp.diag(some) - jnp.where(full, jnp.outer(some, some) / jnp.maximum(jnp.sum(some), 1), 0)
         return along @ bend @ along + eye - along, along @ gradient

@@ -95,7 +95,10 @@ def digest(problem: Problem, n: int) -> str:
                 if closed is not None:  # a function that cannot be traced is refused by the checks
                     (numbers, *called), _ = fingerprint(closed.jaxpr, closed.consts)
                     account.update(repr((numbers, *map(text_of_called, called))).encode())
-        account.update(repr((problem.isaacs, type(problem.controls), type(problem.disturbances))).encode())
+        sets = (problem.controls, problem.disturbances)
+        # the structure of a set holds its kind, its dimension, and whether the sum of a simplex may be smaller
+        kinds = [type(each) if callable(each) else jax.tree.structure(each) for each in sets]
+        account.update(repr((problem.isaacs, *kinds)).encode())
         for leaf in jax.tree.leaves(problem):
             account.update(np.asarray(leaf, np.float64).tobytes())
     return account.hexdigest()

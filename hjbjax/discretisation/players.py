@@ -1,8 +1,8 @@
 """The two players: their sets, and how the Hamiltonian depends on them, read from the problem's functions.
 
 The optimum over a player's actions is exact if the drift is affine in them, the noise independent of them, and the cost
-quadratic, over a box, a ball or a simplex of any dimension. Inputs that drive a common component, or whose product enters the
-cost, form a group. The method depends on the group:
+quadratic, over a box, a ball or a simplex of any dimension. Inputs that drive a common component, or whose product
+enters the cost, form a group. The method depends on the group:
 
     one input of a box, or two without a product    all ends, kinks and stationary points are tried (``piecewise``)
     a ball, one component per input at most         all combinations of pieces are tried (``ball``)

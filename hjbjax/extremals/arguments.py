@@ -42,8 +42,8 @@ def check_problem(problem: object, tol: float, max_nodes: int) -> None:
         raise ValueError("pontryagin: got a problem without controls, wanted a Box, a Ball or a Finite to choose from")
     if isinstance(problem.controls, Simplex):
         raise ValueError(
-            "pontryagin: got controls in a Simplex, wanted a Box, a Ball or a Finite: the conditions have no multiplier\n"
-            "for the sum of the controls; solve the problem on a grid, or enumerate the controls with Simplex.grid(num)"
+            "pontryagin: got controls in a Simplex, wanted a Box, a Ball or a Finite: the conditions have no\n"
+            "multiplier for the sum of the controls; solve the problem on a grid, or enumerate Simplex.grid(num)"
         )
     refuse_unbounded(problem.controls, "pontryagin", "the guess starts from samples between them")
     if not (np.ndim(tol) == 0 and 0 < tol < 1):

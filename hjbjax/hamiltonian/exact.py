@@ -1,4 +1,4 @@
-"""The exact optimum of the discrete Hamiltonian over a box, a ball or a simplex: its pieces, read from a problem's functions.
+"""The exact optimum of the discrete Hamiltonian over a box, a ball or a simplex, from pieces of a problem's functions.
 
 The drift is affine in the player's inputs and the cost quadratic (see ``players``), so derivatives at zero give all
 coefficients. From them ``piecewise``, ``ball`` and ``quadratic_program`` find the optimum of each group of inputs.
@@ -161,10 +161,10 @@ def _in_simplex(part: _Part) -> Action:
         return [*found, jnp.where(rest > ROUNDING * jnp.finfo(rest.dtype).eps * admissible.total, rest, 0)]
     if player.programs[0]:
         return _programmed(part, group)[0]
-    (linear,), (square,) = _separable(part)
+    (slope,), (bend,) = _separable(part)
     pieces = [part.gain(i, group) for i in player.driven[0]]
     zero, total = (jnp.asarray(end, part.hamiltonian.on.dtype) for end in (0, admissible.total))
-    return [piecewise_input(player.sign, zero, total, linear, square, pieces, curved=player.curved[0])]
+    return [piecewise_input(player.sign, zero, total, slope, bend, pieces, curved=player.curved[0])]
 
 
 def _separable(part: _Part) -> tuple[list[PerNode], list[PerNode]]:
@@ -182,7 +182,7 @@ def _in_free_inputs(part: _Part) -> _Part:
         return part
     total, count = jnp.asarray(admissible.total, part.hamiltonian.on.dtype), admissible.freedom
     last, bends = part.slopes[count], [[_bend(part, j, k) for k in range(count + 1)] for j in range(count + 1)]
-    quadratic = {}
+    quadratic: dict[tuple[int, ...], PerNode] = {}
     for j, k in itertools.combinations_with_replacement(range(count), 2):
         bend = bends[j][k] - bends[j][count] - bends[count][k] + bends[count][count]
         quadratic[j, k] = bend / 2 if j == k else bend

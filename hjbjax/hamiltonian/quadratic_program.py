@@ -167,8 +167,14 @@ def is_convex(bend: jax.Array) -> jax.Array:
     size = jnp.max(jnp.abs(bend), (0, 1))
     rounding = CLOSE * jnp.finfo(bend.dtype).eps * size
     left, sound = bend, jnp.ones(bend.shape[2:], bool)
-    for j in range(len(bend)):  # the pivots of an elimination; if one is zero, the rest of its row must be zero
-        pivot, row = left[j, j], left[j]
+    rest = jnp.ones(bend.shape[1:], bool)
+    # the pivots of an elimination, the largest first, so that rounding does not grow if the matrix is singular; if one
+    # is zero, the rest of its row must be zero
+    for _ in range(len(bend)):
+        own = jnp.where(rest, jnp.stack([left[j, j] for j in range(len(bend))]), -jnp.inf)
+        first = jnp.argmax(own, 0) == jnp.arange(len(bend)).reshape(-1, *(1,) * (bend.ndim - 2))
+        pivot, row = jnp.max(own, 0), jnp.where(rest, jnp.sum(jnp.where(first[:, None], left, 0), 0), 0)
+        rest = rest & ~first
         flat = pivot <= rounding
         sound &= (pivot >= -rounding) & (~flat | (jnp.max(jnp.abs(row), 0) <= jnp.sqrt(rounding * size) + rounding))
         left = left - jnp.where(flat, 0, row[:, None] * row[None] / jnp.where(flat, 1, pivot))
@@ -189,7 +195,8 @@ def _scaled(program: Program, ball: bool) -> tuple[Program, jax.Array, jax.Array
     endless = jnp.isinf(jumps)
     jumps = jnp.where(endless, 0, jumps)
     slope = program.slope + _back(rows, jnp.where(offsets >= 1, jumps, 0))
-    met = (jnp.abs(offsets) < 1) & jnp.any(rows != 0, 1)
+    # a constraint may be satisfied on the boundary only, or at no v; then its violation is the least possible
+    met = ((jnp.abs(offsets) < 1) | (endless & (offsets >= 1))) & jnp.any(rows != 0, 1)
     size = jnp.maximum(jnp.max(jnp.abs(slope), 0), jnp.max(jnp.abs(program.bend), (0, 1)))
     size = jnp.maximum(size, jnp.max(jnp.where(met & (jumps < 0), -jumps, 0), 0, initial=0))
     # a convex jump is at most a constraint, and may be huge next to an unreachable node, so the rest sets the unit
@@ -349,7 +356,9 @@ def _value(program: Program, v: jax.Array) -> jax.Array:
 def _within(point: Point, jumps: jax.Array, ball: bool) -> Point:
     """The nearest admissible point."""
     length = jnp.sqrt(jnp.sum(point.v**2, 0))
-    v = point.v / jnp.maximum(length, 1) if ball else jnp.clip(point.v, -1, 1)
+    # an input that rounding keeps off its bound would cross a constrained end
+    near = jnp.where(jnp.abs(point.v) >= 1 - 4 * jnp.finfo(point.v.dtype).eps, jnp.sign(point.v), point.v)
+    v = point.v / jnp.maximum(length, 1) if ball else jnp.clip(near, -1, 1)
     return point._replace(v=v, s=jnp.clip(point.s, 0, jumps))
 
 

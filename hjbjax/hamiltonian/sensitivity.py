@@ -8,9 +8,9 @@ that are free at a node satisfy ∂H/∂z = 0, so that
 
 for both players at once. An input is not free if an end of its box or a kink of H holds it. At an end it moves with the
 end. At a kink of the upwinding, f = 0 or with central differences |f| = a/h, it moves so that f stays at the kink. On
-the rim of a ball, |z| = R, there is also a multiplier λ with ∂H/∂z + λ z = 0. The largest input of a simplex is the rest
-of the total, so the others are exchanged for it. Actions from a finite set do not move, nor does an action on which H
-does not depend to second order.
+the rim of a ball, |z| = R, there is also a multiplier λ with ∂H/∂z + λ z = 0. The largest input of a simplex is the
+rest of the total, so the others are exchanged for it. Actions from a finite set do not move, nor does an action on
+which H does not depend to second order.
 """
 
 import dataclasses

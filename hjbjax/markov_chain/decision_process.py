@@ -135,7 +135,10 @@ def action_table(problem: Problem) -> np.ndarray:
         return np.zeros((1, 0))  # a single action without inputs: an uncontrolled chain
     if not isinstance(problem.controls, Finite):  # the resolution of the sampling is the user's choice
         kind = type(problem.controls).__name__
-        raise ValueError(f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, e.g. Box.grid(num) or Simplex.grid(num)")
+        raise ValueError(
+            f"transition_arrays: got controls in a {kind}, wanted Finite: sample it, e.g. Box.grid(num) or "
+            "Simplex.grid(num)"
+        )
     return np.asarray(problem.controls.points, np.float64)
 
 

@@ -48,9 +48,9 @@ class SemiLagrangian(Scheme, Paths):
     where its l is zero, also between nodes. A target of a single node is reached through interpolation.
 
     The minimum is over these arcs only. The actions of a ``Finite`` set are its elements. If drift and cost are affine
-    in the control, the actions are the corners of a box or a simplex, or about ``actions`` directions on the boundary of a ball.
-    Otherwise they are about ``actions`` samples, and the distance between samples limits the accuracy of the control.
-    The policy is the action of the best arc.
+    in the control, the actions are the corners of a box or a simplex, or about ``actions`` directions on the
+    boundary of a ball. Otherwise they are about ``actions`` samples, and the distance between samples limits the
+    accuracy of the control. The policy is the action of the best arc.
 
     Works with ``solve`` outside JAX transformations, by ``ValueIteration()`` or ``PolicyIteration(Sweeps(...))``,
     without noise, disturbances or a ``running_max``, with projected or periodic ends. Without a discount it requires a

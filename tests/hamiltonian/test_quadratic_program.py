@@ -187,6 +187,39 @@ def test_a_cost_that_is_not_convex_is_known():
     assert not np.any(known(jnp.asarray(np.array([[0.0, 1.0], [1.0, 0.0]])[..., None])))
 
 
+@pytest.mark.parametrize("m", [4, 5, 6])
+def test_singular_convex_costs_are_convex(m):
+    """Rounding in the elimination grew with the number of inputs, and took 2 % of such costs for concave."""
+    rng = np.random.default_rng(m)
+    root = rng.normal(size=(m + 1, m + 1, 2000)) * rng.choice([0.0, 1.0], (m + 1, 1, 2000), p=[0.3, 0.7])
+    whole = np.einsum("kin,kjn->ijn", root, root)
+    reduced = whole[:m, :m] - whole[:m, m:] - whole[m:, :m] + whole[m:, m:]
+    assert np.all(is_convex(jnp.asarray(reduced)))
+    least = np.linalg.eigvalsh(reduced.T).T[0]
+    assert not np.any(is_convex(jnp.asarray(reduced - (np.maximum(least, 0) + 1e-3) * np.eye(m)[..., None])))
+
+
+def test_ends_that_only_the_boundary_of_the_set_respects():
+    """u[0] = u[1] = u[2] = 0 is the only action at the corner; it was not found, so the problem was refused."""
+    gain = -np.array([[3.0, 1, 0], [0, 1, 2]])
+    bent = np.array([[1.0, 0.5, 0], [0.5, 1, 0.5], [0, 0.5, 1]])
+    numbers = {"b": np.zeros(2), "G": gain, "l": np.array([-3.0, 0, -2]), "Q": bent}
+    problem = problem_of(numbers, hjb.Box([0.0] * 3, [1.0] * 3))
+    grid = hjb.Grid([0.0, 0.0], [1.0, 1.0], SHAPE, edges="constrained")
+
+    @jax.jit
+    def best(problem):
+        on = Discretisation(problem, grid, hjb.Upwind(), np.dtype(np.float64))
+        least, u, _ = optimum.optimise(discrete.around(on, jnp.zeros(SHAPE)))
+        return least, jnp.stack(u, -1)
+
+    least, u = best(problem)
+    assert u[0, 0].tolist() == [0.0, 0.0, 0.0]
+    wanted = np.full(SHAPE, -3.0)
+    wanted[0], wanted[:, 0], wanted[0, 0] = -1, -2, 0
+    np.testing.assert_allclose(least, wanted, atol=1e-12)
+
+
 def test_where_it_is_not_convex_the_bound_holds():
     """An indefinite cost: the answer is hardly ever a local minimum only, and not further off than the bound says."""
     admissible, off = admissible_set("box", 3), []

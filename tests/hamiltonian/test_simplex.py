@@ -56,7 +56,7 @@ def test_projection(n, at_most, total):
 
 @pytest.mark.parametrize("at_most", [False, True])
 def test_separable_minima_satisfy_their_conditions(at_most):
-    """Also without curvature in some inputs: all positive inputs have the same slope, and no other has a smaller one."""
+    """Also without curvature in some inputs: positive inputs have the same slope, and no other has a smaller one."""
     rng = np.random.default_rng(0)
     linear, square = rng.normal(size=(2, 4, 500))
     square = np.abs(square) * rng.choice([0.0, 1.0], square.shape)
@@ -171,14 +171,22 @@ def scanned(numbers, value, sigma, simplex, intervals):
         # a smaller copy of the simplex around the best point, shifted into the simplex
         centre = np.maximum(winner - size * simplex.total / simplex.dim, 0)
         spare = (1 - size) * simplex.total - np.sum(centre, -1, keepdims=True)
-        centre = np.where(spare < 0, centre * (1 + spare / np.maximum(np.sum(centre, -1, keepdims=True), 1e-300)), centre)
+        centre = np.where(
+            spare < 0, centre * (1 + spare / np.maximum(np.sum(centre, -1, keepdims=True), 1e-300)), centre
+        )
         if not simplex.at_most:
             centre = centre + np.maximum(spare, 0) * winner / simplex.total
     return best
 
 
 CASES = [(2, False, False, 1.0), (3, False, False, 1.0)]
-SLOW = [(2, True, True, 1.0), (3, True, False, 1e3), (3, False, True, 1e-3), (4, False, False, 1.0), (5, False, False, 1.0)]
+SLOW = [
+    (2, True, True, 1.0),
+    (3, True, False, 1e3),
+    (3, False, True, 1e-3),
+    (4, False, False, 1.0),
+    (5, False, False, 1.0),
+]
 CASES += [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW]
 
 
@@ -194,7 +202,8 @@ def test_no_point_is_better_than_the_minimum(n, at_most, noisy, total):
         assert np.all(sets.holds(simplex, u))
         assert np.all(u >= 0)
         size = np.max(np.abs(value)) / np.min(SPACING)
-        assert np.max(missed) < 1e-11 * size
+        # at a vertex the sum and an upper bound are active together, which leaves their multipliers fewer digits
+        assert np.max(missed) < 1e-9 * size
         np.testing.assert_allclose(hamiltonians(numbers, value, sigma, u), best, atol=1e-13 * size)
         off.append((best - scanned(numbers, value, sigma, simplex, {2: 40, 3: 24, 4: 12, 5: 8}[n])) / size)
     assert np.max(off) < 1e-11

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hjbjax import Ball, Box, Finite
+from hjbjax import Ball, Box, Finite, Simplex
+from hjbjax.problem.sets import extremes, holds, samples, spacing
 
 
 @pytest.mark.parametrize(
@@ -128,3 +129,70 @@ def test_sets_stack_and_unstack():
     boxes = jax.tree.map(lambda *leaves: np.stack(leaves), *(Box([-bound], [bound]) for bound in (1.0, 2.0)))
     assert boxes.dim == 1
     assert jax.vmap(lambda box: box.hi[0] - box.lo[0])(boxes).tolist() == [2.0, 4.0]
+
+
+# --- the simplex ---
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ((0,), ValueError, "got dim = 0, wanted a positive integer"),
+        ((2.0,), ValueError, "got dim = 2.0, wanted a positive integer"),
+        ((True,), ValueError, "got dim = True, wanted a positive integer"),
+        (([0.5, 0.5],), ValueError, "wanted a positive integer: the number of inputs"),
+        ((2, 0.0), ValueError, "got total = 0, wanted a positive number"),
+        ((2, -1.0), ValueError, "got total = -1, wanted a positive number"),
+        ((2, float("nan")), ValueError, "Simplex.total.*wanted finite numbers"),
+        ((2, float("inf")), ValueError, "Simplex.total.*wanted finite numbers"),
+        ((2, [1.0, 2.0]), ValueError, "a total of shape \\(2,\\), wanted one number"),
+        ((2, "1"), TypeError, "Simplex.total: got .* wanted numbers"),
+        ((2, 1.0, 3), TypeError, "got at_most = 3, wanted True or False"),
+    ],
+)
+def test_simplex_refuses(arguments, error, words):
+    with pytest.raises(error, match=words):
+        Simplex(*arguments)
+
+
+@pytest.mark.parametrize("num", [0, 1, 2.0, True, [3, 3]])
+def test_a_simplex_is_sampled_with_at_least_two_values_per_input(num):
+    with pytest.raises(ValueError, match=r"Simplex.grid: got .*, wanted an integer of at least 2"):
+        Simplex(3).grid(num)
+
+
+@pytest.mark.parametrize("at_most", [False, True])
+@pytest.mark.parametrize("dim", [1, 2, 3, 5, 12])
+@pytest.mark.parametrize("budget", [1, 9, 33, 64])
+def test_samples_of_a_simplex(dim, at_most, budget):
+    simplex = Simplex(dim, 2.5, at_most)
+    points, corners = samples(simplex, budget), extremes(simplex)
+    assert len(points) <= max(budget, dim + at_most) + 1
+    assert np.all(holds(simplex, points))
+    found = {tuple(row) for row in points.tolist()}
+    assert {tuple(row) for row in corners.tolist()} <= found
+    assert len(found) == len(points)
+    assert len(corners) == dim + at_most
+    assert np.min(np.linalg.norm(points - 2.5 / (dim + at_most), axis=1)) < 1e-12  # the centre
+    assert all(0 < width <= 2.5 for width in spacing(simplex, budget))
+
+
+def test_the_lattice_of_a_simplex_is_complete():
+    rows = [row for row in itertools.product(range(5), repeat=3) if sum(row) <= 4]
+    assert Simplex(3, 4.0, at_most=True).grid(5).points.tolist() == [list(row) for row in rows]
+    assert Simplex(3, 4.0).grid(5).points.tolist() == [list(row) for row in rows if sum(row) == 4]
+    assert Simplex(1, 4.0).grid(5).points.tolist() == [[4.0]]
+
+
+@pytest.mark.parametrize("total", [1e-6, 1.0, 1e6])
+def test_a_simplex_holds_its_points_up_to_rounding(total):
+    points = total * np.array([[0.3, 0.7], [1.0, 0.0], [1 + 1e-8, -1e-8], [0.2, 0.3], [0.7, 0.7], [1.1, -0.1]])
+    assert holds(Simplex(2, total), points).tolist() == [True, True, True, False, False, False]
+    assert holds(Simplex(2, total, at_most=True), points).tolist() == [True, True, True, True, False, False]
+
+
+def test_the_total_is_a_leaf():
+    assert jax.tree.leaves(Simplex(3, 2.0)) == [2.0]
+    assert Simplex(3, 2.0, True).freedom == 3
+    assert Simplex(3, 2.0).freedom == 2
+    jax.jit(lambda total: Simplex(3, total).total)(-1.0)  # not known, not refused

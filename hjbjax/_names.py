@@ -28,6 +28,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.jumps import Jump
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pushes import Push
 from hjbjax.problem.sets import Ball, Box, Finite, Simplex
 from hjbjax.problem.stretching import Sinh
 from hjbjax.semi_lagrangian.scheme import SemiLagrangian
@@ -68,6 +69,7 @@ __all__ = [
     "Neumann",
     "PolicyIteration",
     "Problem",
+    "Push",
     "Robin",
     "SemiLagrangian",
     "Simplex",

@@ -249,6 +249,11 @@ def _system(
     # check here, because its target is read before ``solve`` checks the problem
     if not isinstance(problem, Problem):
         raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
+    if problem.push_steps or problem.pushes:
+        raise ValueError(
+            f"{name}: got a problem with pushes; wanted one without, because a probability or a time cannot be added "
+            "to a\ncost. Leave out pushes, or bound the speed of the motion by a control"
+        )
     if problem.switching_costs is not None:
         raise ValueError(
             f"{name}: got modes with a switching_cost; wanted modes that change only at random, because a probability "

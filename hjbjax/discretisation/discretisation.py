@@ -16,6 +16,7 @@ import numpy as np
 
 from hjbjax.discretisation import cut_cells, stencil
 from hjbjax.discretisation.landing import Corners, corners
+from hjbjax.discretisation.interventions import Interventions
 from hjbjax.discretisation.paths import Paths
 from hjbjax.discretisation.players import Players, find_players
 from hjbjax.discretisation.stencil import Links
@@ -304,6 +305,28 @@ class Discretisation:
         where = self.problem.state_arguments(self.coordinates(), self.t)
         found = components.components(costs, *where, dtype=self.dtype)
         return [jnp.broadcast_to(jnp.asarray(cost, self.dtype), self.grid.shape) for cost in found]
+
+    def interventions(self) -> Interventions:
+        """The changes of the mode and the pushes that the controller may choose, with their costs at the nodes.
+
+        A push costs the mean of c at both nodes times their distance. No push leads across an end of the box.
+        """
+        grid, problem = self.grid, self.problem
+        costs = self.switching_costs()
+        offsets = [stencil.unit(grid, 0, number) for number in range(1, len(costs) + 1)]
+        changes, steps = len(costs), problem.push_steps
+        if steps:
+            where = problem.state_arguments(self.coordinates(), self.t)
+            marginal = components.components(problem.push_costs, *where, dtype=self.dtype)
+        for (axis, step), price in zip(steps, marginal if steps else (), strict=True):
+            price, offset = jnp.broadcast_to(jnp.asarray(price, self.dtype), grid.shape), stencil.unit(grid, axis, step)
+            link = stencil.grid_links(grid, axis)
+            length = jnp.asarray(link.up if step > 0 else link.down, self.dtype)
+            paid = (price + stencil.neighbour(price, grid, offset)) / 2 * length
+            costs.append(jnp.where(stencil.on_edge(grid, axis, step), jnp.inf, paid))
+            offsets.append(offset)
+        once = len(steps) == 1 and not changes and not grid.periodic[steps[0][0]]
+        return Interventions(tuple(offsets), tuple(costs), changes, once)
 
     @property
     def decay(self) -> Any:

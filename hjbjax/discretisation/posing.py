@@ -1,11 +1,13 @@
-"""Decorators of public functions, for problems with modes, and with bounds or a discount that depend on the state.
+"""Decorators of public functions, for problems with modes, pushes, and bounds or a discount that depend on the state.
 
-The solvers support fixed sets of controls and constant discounts, and modes as the first entry of the state. A
+The solvers support fixed sets of controls and constant discounts, modes as the first entry of the state, and pushes as
+one function of the state. A
 decorated function receives such a problem, and its grid, instead of the user's. In the solutions that it returns, the
 controls and the problem are the user's again. The grid keeps its axis of modes.
 """
 
 import inspect
+import itertools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
@@ -37,8 +39,8 @@ T = TypeVar("T")
 def without_horizon(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function of (problem or problems, grid, ...) without a horizon.
 
-    Problems without modes, with a constant discount, and with a fixed set of controls or no control, pass through
-    unchanged.
+    Problems without modes and pushes, with a constant discount, and with a fixed set of controls or no control, pass
+    through unchanged.
     """
     return _posing(function, _in_own_time)
 
@@ -63,7 +65,7 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
             return function(**given)
         if isinstance(grid, Grid):
             n = without_modes(grid).ndim
-            joined = [_for_solvers(each, n) if _jumps_or_has_modes(each) else each for each in problems]
+            joined = [_for_solvers(each, n) if _is_joined(each) else each for each in problems]
             given[second] = grid = _grid_of_all(grid, problems, name)
             made = [posed(each, grid) if _needs_posing(each) else each for each in joined]
             given[first] = made[0] if isinstance(asked, Problem) else made
@@ -82,9 +84,8 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
 def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorator of a public function of (problem, grid, ...): a problem with modes gets the mode as its first state.
 
-    Jumps of the state become functions of all arguments.
-
-    The function also receives the grid with an axis of modes. Problems without modes pass through unchanged.
+    The function also receives the grid with an axis of modes, and jumps and pushes as functions. Problems without modes,
+    jumps and pushes pass through unchanged.
 
     Args:
       *of_state: names of arguments that are functions of the state, which the user writes with the mode last.
@@ -95,9 +96,9 @@ def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]
 
         def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
             problem, grid = given[first], given[second]
-            if _jumps_or_has_modes(problem) and isinstance(grid, Grid):
+            if _is_joined(problem) and isinstance(grid, Grid):
                 given[first] = _for_solvers(problem, without_modes(grid).ndim)
-            if _jumps_or_has_modes(problem) and problem.modes is not None and isinstance(grid, Grid):
+            if _has_modes(problem) and isinstance(grid, Grid):
                 given[second] = with_modes(grid, problem.modes.names)
                 given |= {name: of_mode(given[name], problem.modes) for name in of_state if name in given}
             return function(**given)
@@ -108,20 +109,25 @@ def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]
 
 
 def _needs_posing(problem: object) -> bool:
-    """True for a problem with modes or jumps, or whose bounds or discount are functions of the state."""
+    """True for a problem with modes, jumps or pushes, or whose bounds or discount are functions of the state."""
     if not isinstance(problem, Problem):
         return False
-    return _jumps_or_has_modes(problem) or callable(problem.discount) or callable(problem.controls)
+    return _is_joined(problem) or callable(problem.discount) or callable(problem.controls)
 
 
-def _jumps_or_has_modes(problem: object) -> bool:
-    """True for a problem with modes, or with jumps of the state."""
-    return isinstance(problem, Problem) and (problem.modes is not None or bool(problem.jumps))
+def _has_modes(problem: object) -> bool:
+    """True for a problem with modes."""
+    return isinstance(problem, Problem) and problem.modes is not None
 
 
 def _for_solvers(problem: Problem, n: int) -> Problem:
     """The problem with costs, the mode as its first state, and the mean costs of its jumps in the running cost."""
     return with_mean_jump_costs(over_checked_modes(costs_of(problem), n))
+
+
+def _is_joined(problem: object) -> bool:
+    """True for a problem with modes, jumps or pushes, which ``over_checked_modes`` changes."""
+    return _has_modes(problem) or (isinstance(problem, Problem) and bool(problem.jumps or problem.pushes))
 
 
 def _grid_of_all(grid: Grid, problems: list[Problem], name: str) -> Grid:
@@ -252,20 +258,21 @@ def _least(on: Discretisation) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def over_checked_modes(problem: Problem, n: int) -> Problem:
-    """The problem whose state begins with the mode, and whose jumps are functions of all its arguments.
+    """The problem whose state begins with the mode, and whose jumps and pushes are functions.
 
     The functions are checked in every mode on one state.
 
     Raises:
-      ValueError: a function of the wrong shape, in some mode.
+      ValueError: a function of the wrong shape, in some mode, or a push whose direction has another length.
     """
     modes = problem.modes
+    _check_pushes(problem, n)
     if modes is None:
         checks.jumps_of_one_state(with_any_control(problem, n), n)
-        return with_jump_functions(problem)
+        return over_modes(with_jump_functions(problem), n)
     for number, name in enumerate(modes.names):
         try:
-            one = with_any_control(in_mode(problem, number), n)
+            one = with_any_control(altered(in_mode(problem, number), pushes=()), n)
             checks.jumps_of_one_state(one, n)
             checks.of_one_state(altered(one, jumps=()), n, "the number of axes of the grid")
         except ValueError as error:
@@ -281,3 +288,18 @@ def over_checked_modes(problem: Problem, n: int) -> Problem:
             shapes = {letter: sizes.get(letter, ()) for letter in names}
             checks.function_of(table, f"Modes.{name}: {name}", (len(modes.names),) * 2, **shapes)
     return over_modes(with_jump_functions(problem), n)
+
+
+def _check_pushes(problem: Problem, n: int) -> None:
+    """Check directions and costs of the pushes on one state, in every mode."""
+    for push in problem.pushes:
+        if len(push.direction) != n:
+            raise ValueError(
+                f"Push.direction: got {list(push.direction)}, wanted {n} entries, one per axis without the modes"
+            )
+    shapes = {letter: (n,) if letter == "x" else () for letter in problem.state_arguments("x", "t")}
+    each = [problem] if problem.modes is None else [in_mode(problem, mode) for mode in range(len(problem.modes.names))]
+    for push in itertools.chain(*(one.pushes for one in each)):
+        for name in ("cost", "reward"):
+            if callable(paid := getattr(push, name)):
+                checks.function_of(paid, f"Push.{name}: {name}", (), **shapes)

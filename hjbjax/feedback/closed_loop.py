@@ -11,6 +11,8 @@ chatters within f·(that step) of the curve, like a fast sampler. A zero-order h
 With noise: fixed steps in the Itô sense on a virtual Brownian tree. Noise that is a number or a matrix uses SRA1
 (strong order 1.5 in a smooth closed loop); noise that is a function uses Euler–Maruyama (strong order ½, weak order 1).
 Rejecting steps would bias the law of the path, so ``rtol`` and ``atol`` are ignored.
+With pushes the steps are fixed too, without noise those of Euler's method, and the state is pushed after every step,
+see ``pushing``.
 
 After every internal step the path is tested for the target, the boundary of the box and the end of the region in which
 the players are defined. Bisection of the interpolant locates the crossing, and the path ends just beyond it. A Solution
@@ -29,9 +31,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, are_finite, bridging, meeting_flag, onto_edge
+from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, adjusting, are_finite, meeting_flag, onto_edge
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.payments import is_tube
+from hjbjax.feedback.pushing import after_pushes
 from hjbjax.feedback.sudden_changes import after_changes
 from hjbjax.hamiltonian.derivatives import with_both_modes
 from hjbjax.problem.pytree import pytree_dataclass
@@ -179,6 +182,10 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
         shown = jax.tree.map(lambda a: jnp.where(active, a, jnp.nan), (u, d))
         return (t, y, code.astype(jnp.int32), count, extremes), (t, y[:-1], *shown, active)
 
+    y = jnp.append(x0, 0.0)
+    if loop.push is not None:  # not in the target, where the path has ended
+        y = jnp.where(loop.target(start, x0) <= 0, y, after_pushes(loop, start, y, start))
+    x0 = y[:-1]
     # the target comes last and wins: a start that is in the target and outside the box has reached the target
     code = jnp.where(loop.margin(x0) > 0, PathStatus.DURATION, PathStatus.LEFT_BOX)
     code = jnp.where(loop.target(start, x0) <= 0, PathStatus.TARGET, code).astype(jnp.int32)
@@ -186,7 +193,6 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
     extremes = jnp.asarray([jnp.inf, -jnp.inf], x0.dtype)
     if is_tube(loop.problem):
         extremes = _extremes(loop, start, (start[None], x0[None]), extremes)
-    y = jnp.append(x0, 0.0)
     y = after_changes(loop, start, y, start) if loop.clock else y
     return interval, (start, y, code, jnp.zeros((), jnp.int32), extremes)
 
@@ -287,7 +293,7 @@ def _advance(
     t, end, last = times  # start and end of the interval, and the last of all times
     # under vmap steps of a finished path are computed too, and must not go beyond the Brownian path
     width = jnp.where(end > t, end - t, jnp.where(last > t, last - t, 1))
-    if loop.problem.noise is None:
+    if not loop.has_equal_steps:
         step = jnp.minimum(width, stepping.max_step)
     else:
         # equal steps that end on the output time; 1e-6 absorbs a quotient that rounding puts just above an integer
@@ -363,20 +369,23 @@ def _solver(ivp: InitialValueProblem, stepping: Stepping, reverse: bool) -> Call
     terms: diffrax.AbstractTerm = diffrax.ODETerm(rate)
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
-    if loop.problem.noise is None:
+    if not loop.has_equal_steps:
         solver = diffrax.Tsit5()
         # force_dtmin accepts the shortest step for any error; half of max_steps such steps reach the end
         controller = diffrax.PIDController(
             rtol=stepping.rtol, atol=stepping.atol, dtmin=2 * duration / stepping.max_steps, dtmax=stepping.max_step,
             force_dtmin=True, norm=_size,
         )  # fmt: skip
+    elif loop.problem.noise is None:
+        solver, controller = adjusting(diffrax.Euler)(after=_after_steps(ivp, stepping)), diffrax.ConstantStepSize()
     else:
         additive = not callable(loop.problem.noise)
         brownian = _brownian(ivp, stepping.max_step, additive)
         terms = diffrax.MultiTerm(terms, diffrax.ControlTerm(noise, brownian))
         # SRA1 has its order only for additive noise; a function may depend on the state, so it uses Euler
         kind, controller = diffrax.SRA1 if additive else diffrax.Euler, diffrax.ConstantStepSize()
-        solver = bridging(kind)(flag=_flag_of_steps(ivp, stepping)) if bridged else kind()
+        adjusted = bridged or loop.push is not None
+        solver = adjusting(kind)(after=_after_steps(ivp, stepping)) if adjusted else kind()
     event = None
     ends = loop.clock or loop.guarded or loop.ends or (loop.grid is not None and not loop.clamp)
     if ends:  # an event doubles the compile time
@@ -407,15 +416,21 @@ def _on_target(loop: Loop, stepping: Stepping, t: Number, x: State, beginning: B
     return onto_edge(functools.partial(loop.target, t), x, sigma)
 
 
-def _flag_of_steps(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
-    """The flag that ``loop.bridging`` writes at the end of a step."""
-    loop, n, draw = ivp.loop, len(ivp.x0), BridgeDraw(ivp.key)
+def _after_steps(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
+    """The state at the end of a step for ``loop.adjusting``: pushed, and with the flag of a bridge."""
+    loop, n, draw, start = ivp.loop, len(ivp.x0), BridgeDraw(ivp.key), ivp.times[0]
 
-    def flag(t: Array, later: Array, y: Array, moved: Array, beginning: Beginning) -> jax.Array:
+    def after(t: Array, later: Array, y: Array, moved: jax.Array, beginning: Beginning) -> jax.Array:
+        if loop.push is None:
+            pushed = moved
+        else:  # also beyond a target, where a bridge ends the path before the end of the step
+            pushed = jnp.concatenate([after_pushes(loop, later, moved[: n + 1], start), moved[n + 1 :]])
+        if not _is_bridged(loop):
+            return pushed
         sigma = loop.noise(t, y[:n], *_acting(loop, stepping, t, y[:n], beginning))[:-1]
-        return meeting_flag(loop, draw, sigma, (t, y[:n]), (later, moved[:n]))
+        return pushed.at[-1].set(meeting_flag(loop, draw, sigma, (t, y[:n]), (later, moved[:n])))
 
-    return flag
+    return after
 
 
 def _brownian(ivp: InitialValueProblem, max_step: Number, additive: bool) -> "diffrax.VirtualBrownianTree":

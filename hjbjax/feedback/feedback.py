@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 # fields that no lookup reads; a solution without an estimate would compile another program than one with it
 UNREAD = (
     "code", "steps", "enclosure", "isaacs_gap", "reached", "grid_error", "box_error", "monotone_error", "cut",
-    "stopping", "active",
+    "stopping", "active", "pushing",
 )  # fmt: skip
 FEWEST = 10  # intervals between stored times that a marched feedback needs over a path
 ROUNDING = 1e-9  # relative tolerance for comparing times, which may be sums of steps

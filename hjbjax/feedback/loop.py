@@ -58,6 +58,8 @@ class Loop:
       clock: the position of the clock in the state, which is zero when the mode or the state changes at random. Zero
         without sudden changes.
       key: the key of the random changes.
+      push: the way to the boundary of the push region and its cost, (n + 1,), as a function of (t, x); None without
+        pushes. See ``pushing``.
     """
 
     problem: Problem
@@ -72,6 +74,12 @@ class Loop:
     modes: int = 0
     clock: int = 0
     key: Key | None = None
+    push: Any = None
+
+    @property
+    def has_equal_steps(self) -> bool:
+        """True if the steps of the integrator do not adapt: with noise, and with pushes, which act between steps."""
+        return self.problem.noise is not None or self.push is not None
 
     def wrap(self, x: State) -> State:
         """The state with its periodic entries wrapped into the box."""
@@ -384,21 +392,21 @@ def meeting_flag(loop: Loop, draw: BridgeDraw, sigma: Array, begins: Event, ends
 
 
 @functools.cache
-def bridging(kind: type) -> type:
-    """A diffrax solver that writes the flag of each step into the last entry of the state at its end."""
+def adjusting(kind: type) -> type:
+    """A diffrax solver that changes the state at the end of each step, by pushes and by the flag of a bridge."""
 
-    class Bridging(kind):
-        flag: Any = None  # a field after the base class's fields needs a default
+    class Adjusting(kind):
+        after: Any = None  # a field after the base class's fields needs a default
 
         def step(
             self, terms: Any, t0: Number, t1: Number, y0: jax.Array, args: Any, solver_state: Any, made_jump: Any
         ) -> tuple[jax.Array, Any, dict[str, Any], Any, Any]:
             y1, error, dense, state, result = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-            y1 = y1.at[-1].set(self.flag(t0, t1, y0, y1, args))
-            # the event is located on the straight line between the ends, the interpolant of both of these solvers
+            y1 = self.after(t0, t1, y0, y1, args)
+            # the event is located on the straight line between the ends, the interpolant of all of these solvers
             return y1, error, {**dense, "y1": y1}, state, result
 
-    return Bridging
+    return Adjusting
 
 
 def timeless(function: Callable, t: Number, x: State) -> Array:

@@ -24,6 +24,7 @@ from hjbjax.feedback.sudden_changes import (
     with_modes_apart,
     without_clock,
 )
+from hjbjax.feedback.pushing import push_table
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
@@ -82,6 +83,9 @@ def simulate(
         A marched Solution must be stored at enough times: at least ten over the duration. A path as long as the horizon
         pays at its end what ``march`` assumed there: ``start``, the terminal cost, else ψ, else g.
         If the feedback is a function, the terminal cost is paid at the end.
+        With pushes it must be a Solution, which knows where they are optimal. A path that starts in the push region
+        jumps to its boundary at once, after the first entry of ``states``. Later it is moved back to the boundary after
+        every internal step, of equal lengths as with noise: its law has order ½ in this step, its mean cost order 1.
       x0: the state at time 0, shape (n,).
       duration: the length of the path unless it reaches the target earlier, in units of time.
 
@@ -210,7 +214,8 @@ def _is_traced(problem: object, *others: Any) -> bool:
     modes = getattr(problem, "modes", None)
     tables = [] if modes is None else [modes.rates, modes.switching_cost]
     functions = [getattr(problem, name, None) for name in names]
-    functions += [each for each in (*tables, *others) if callable(each)]
+    paid = [each for push in getattr(problem, "pushes", ()) for each in (push.cost, push.reward)]
+    functions += [each for each in (*tables, *paid, *others) if callable(each)]
     return is_traced(problem, *others) or any(map(holds_tracers, functions))
 
 
@@ -315,12 +320,14 @@ def rollout(
 def _over_modes(
     problem: Problem, feedback: Feedback, disturbance: Callable | None, grid: Grid | None, n: int
 ) -> tuple[Problem, Feedback, Callable | None, Grid | None]:
-    """Everything for a state that begins with the mode, with the jumps as functions; unchanged without both."""
+    """Everything for a state that begins with the mode, with jumps and pushes as functions; unchanged without all."""
     modes = problem.modes
     if (modes is not None or problem.jumps) and problem.running_max is not None:
         raise ValueError("simulate: got running_max with modes or jumps; the cost of such a path is not computed")
     if modes is None:
         return over_checked_modes(problem, n), feedback, disturbance, grid
+    if problem.pushes:
+        raise ValueError("simulate: got modes and pushes; paths with both are not computed. Leave out one of them")
     players = (of_mode(player, modes) for player in (feedback, disturbance))
     return over_checked_modes(problem, n), *players, grid_of_modes(grid, modes)
 
@@ -369,6 +376,7 @@ def _close(
     return Loop(
         problem, control, as_partial(opponent), grid, bool(clamp), surplus(problem, feedback), due,
         value_at_horizon(feedback) if due == "V at the horizon" else None, switching_surplus(problem, feedback),
+        push=push_table(problem, feedback),
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ then differentiated at fixed actions, and a Krylov method, preconditioned by swe
 system.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeAlias
@@ -28,7 +29,7 @@ from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian import discrete, sensitivity
 from hjbjax.hamiltonian.derivatives import once
 from hjbjax.hamiltonian.search import Action
-from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation, with_changes
+from hjbjax.iteration.bellman import Greedy, Obstacles, PolicyEquation, with_interventions
 from hjbjax.iteration.evaluation import Evaluation, Krylov, direct, evaluate, left_over, relaxed
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.problem.grid import Grid
@@ -215,10 +216,10 @@ def _chain_solvers(evaluation: Evaluation, equation: PolicyEquation, grid: Grid)
         forward, backward = (_exact(equation, grid, transposed) for transposed in (False, True))
         return lambda _, right: forward(right), lambda _, right: backward(right)
 
-    def solver(weights: Rates) -> LinearSolve:
-        return lambda _, right: refined(evaluation, PolicyEquation(right, weights), grid)
+    def solver(of: PolicyEquation) -> LinearSolve:
+        return lambda _, right: refined(evaluation, dataclasses.replace(of, source=right), grid)
 
-    return solver(equation.weights), solver(equation.weights.inflow(grid))
+    return solver(equation), solver(PolicyEquation(equation.source, equation.weights.inflow(grid)))
 
 
 def _exact(equation: PolicyEquation, grid: Grid, transposed: bool) -> Map:
@@ -265,16 +266,17 @@ def _tied_to_constraints(equation: PolicyEquation, obstacles: Obstacles, value: 
         free &= ~_is_constraint(value, constraint)
     # a row without weights reads δ = s, the derivative of the constraint
     weights = equation.weights.scaled(jnp.where(free, 1, 0))
-    return PolicyEquation(equation.source, with_changes(weights, _changes(obstacles, value)), equation.fastest)
+    weights = with_interventions(weights, obstacles.interventions, _interventions(obstacles, value))
+    return dataclasses.replace(equation, weights=weights)
 
 
-def _changes(obstacles: Obstacles, value: Field) -> list[jax.Array]:
-    """The nodes at which the mode changes by 1, ..., k − 1: V is the value after this change, and no other bound."""
+def _interventions(obstacles: Obstacles, value: Field) -> list[jax.Array]:
+    """The nodes of every intervention: V is the value after this intervention, and no other bound."""
     left, found = ~obstacles.fixed, []
     for constraint in (obstacles.upper, obstacles.lower):
         if constraint is not None:
             left &= ~_is_constraint(value, constraint)
-    for after in obstacles.after_change(value):
+    for after in obstacles.interventions.after(value):
         found.append(left & _is_constraint(value, after))
         left = left & ~found[-1]
     return found
@@ -300,7 +302,7 @@ def refined(evaluation: Evaluation, equation: PolicyEquation, grid: Grid) -> Fie
     """
 
     def by(method: Evaluation) -> Map:
-        return lambda left: evaluate(method, PolicyEquation(left, equation.weights), grid)
+        return lambda left: evaluate(method, dataclasses.replace(equation, source=left), grid)
 
     # the last stage runs to the end, however slowly
     stages = [(by(evaluation), SLOW), (by(Krylov()), jnp.inf)] if evaluation.rough else [(by(evaluation), jnp.inf)]

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 from hjbjax.discretisation import edges, stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.interventions import Interventions
 from hjbjax.discretisation.rates import Rates, fastest_rate, jump_rates
 from hjbjax.hamiltonian import discrete, optimum
 from hjbjax.hamiltonian.search import Action
@@ -41,7 +42,7 @@ class Obstacles:
       lower: g at the nodes, or None.
       ended: bool (*grid), the fixed nodes that are targets, where no further action is taken.
       least_exit: the least exit cost on boundaries between the nodes, a number; zero if none is negative.
-      switching: the costs of changing the mode by 1, ..., k − 1, each (*grid); empty without such changes.
+      interventions: the changes of the mode and the pushes that the controller may make at once.
     """
 
     fixed: jax.Array
@@ -50,19 +51,11 @@ class Obstacles:
     lower: Field | None = None
     ended: jax.Array | bool = False
     least_exit: Number = 0.0
-    switching: tuple[Field, ...] = ()
-
-    def after_change(self, value: Nodes) -> list[Field]:
-        """The cost of changing the mode by 1, ..., k − 1 plus the value there, each (*grid)."""
-        return [cost + jnp.roll(value, -k, 0) for k, cost in enumerate(self.switching, start=1)]
-
-    def least_after_change(self, value: Nodes) -> Field:
-        """min_j (c_ij + V_j), (*grid); only if the controller may change the mode."""
-        return functools.reduce(jnp.minimum, self.after_change(value))
+    interventions: Interventions = Interventions()
 
     def ceiling(self, value: Nodes) -> Field | None:
-        """The bound that stopping and a change of the mode put on V: min(ψ, c_ij + V_j); None without either."""
-        bounds = [*([] if self.upper is None else [self.upper]), *self.after_change(value)]
+        """The bound that stopping and interventions put on V: min(ψ, M V); None without either."""
+        bounds = [*([] if self.upper is None else [self.upper]), *self.interventions.after(value)]
         return functools.reduce(jnp.minimum, bounds) if bounds else None
 
     def impose(self, value: Field) -> Field:
@@ -70,42 +63,18 @@ class Obstacles:
         # ψ before g: where g > ψ the running maximum takes precedence, as in the residual
         if self.upper is not None:
             value = jnp.minimum(value, self.upper)
-        if self.switching:
-            value = self.after_changes(jnp.where(self.fixed, self.fixed_value, value))
-            # the certificate distinguishes nodes where the mode is changed by equality
-            after = self.least_after_change(value)
-            near = after - value <= ROUNDING * jnp.finfo(value.dtype).eps * jnp.abs(value)
-            value = jnp.where(near, after, value)
+        if self.interventions:
+            value = self.interventions.impose(jnp.where(self.fixed, self.fixed_value, value))
         if self.lower is not None:
             value = jnp.maximum(value, self.lower)
         return jnp.where(self.fixed, self.fixed_value, value)
-
-    def after_changes(self, value: Field) -> Field:
-        """The least of ``value`` and of its values in other modes plus the costs of changing to them, (*grid)."""
-        for _ in self.switching:  # a cheapest path of changes has at most k − 1 of them
-            value = jnp.minimum(value, self.least_after_change(value))
-        return value
-
-    def changes(self, value: Field) -> list[jax.Array]:
-        """The nodes at which the mode changes by 1, ..., k − 1, if not changing it is worth ``value``; bool (*grid).
-
-        Following the changes of a node leads to a mode that is not changed, since no round trip is free.
-        """
-        bounds = self.after_change(self.after_changes(value))
-        left = functools.reduce(jnp.minimum, bounds, value) < value
-        found = []
-        for k, bound in enumerate(bounds):
-            goes = left & functools.reduce(jnp.logical_and, (bound <= other for other in bounds[k + 1 :]), left)
-            found.append(goes)
-            left = left & ~goes
-        return found
 
     def clipped(self, step: Field, value: Field) -> Field:
         """max(min(s, ψ − V), g − V) for a step s, and zero where V is fixed."""
         if self.upper is not None:
             step = jnp.minimum(step, self.upper - value)
-        if self.switching:  # to one step in the other mode, so that V_i = c_ij + V_j after it
-            step = self.after_changes(value + jnp.where(self.fixed, 0, step)) - value
+        if self.interventions:  # to one step at the node to which they lead, so that V = M V after it
+            step = self.interventions.cheapest(value + jnp.where(self.fixed, 0, step)) - value
         if self.lower is not None:
             step = jnp.maximum(step, self.lower - value)
         return jnp.where(self.fixed, 0, step)
@@ -137,12 +106,14 @@ class Greedy:
 class PolicyEquation:
     """The linear equation δ = source + Σ_o weights_o δ(x + o) for a correction δ of the value, in cost units.
 
-    ``fastest`` is the largest Q + β of its policy, per unit time; None if no rate counts as rounding.
+    ``fastest`` is the largest Q + β of its policy, per unit time; None if no rate counts as rounding. The rows of
+    ``interventions`` have the weight one, δ(x) = source + δ(x + o).
     """
 
     source: Field
     weights: Rates
     fastest: Scalar | None = None
+    interventions: Interventions = Interventions()
 
 
 def obstacles(on: Discretisation) -> Obstacles:
@@ -159,7 +130,7 @@ def obstacles(on: Discretisation) -> Obstacles:
         edge = jnp.asarray(stencil.on_edge(on.grid, axis, step))
         given = jnp.where(edge & ~held, jnp.asarray(end.value, on.dtype), given)
         held = held | edge
-    return Obstacles(held, given, stop, floor, ended=held, switching=tuple(on.switching_costs()))
+    return Obstacles(held, given, stop, floor, ended=held, interventions=on.interventions().outside(held))
 
 
 def greedy(
@@ -278,12 +249,13 @@ def policy_equation(
     # s, then min(s, ψ − V), then max(·, g − V); a row whose branch is a constraint reads δ = source
     source, free = policy.defect / outflow, ~obstacles.fixed
     goes: list[jax.Array] = []
-    if obstacles.switching:
+    interventions = obstacles.interventions
+    if interventions:
         # compare with one step in the other mode, not with its value: otherwise two modes may change to each other
         worth = jnp.where(free, value + source, value)
         worth = worth if obstacles.upper is None else jnp.minimum(worth, obstacles.upper)
-        goes = [free & each for each in obstacles.changes(worth)]
-        for each, after in zip(goes, obstacles.after_change(value), strict=True):
+        goes = [free & each for each in interventions.chosen(worth, value)]
+        for each, after in zip(goes, interventions.after(value), strict=True):
             source, free = jnp.where(each, after - value, source), free & ~each
     if obstacles.upper is not None:
         stops = free & (obstacles.upper - value < source)
@@ -298,20 +270,19 @@ def policy_equation(
         jumps = zip(weights.offsets, weights.values, strict=True)
         cut = tuple(jnp.where(stencil.neighbour(loose, on.grid, offset), w, 0) for offset, w in jumps)
         weights = dataclasses.replace(weights, values=cut)
-    weights = with_changes(weights, goes)
-    return PolicyEquation(source, weights, None if every_rate else fastest)
+    weights = with_interventions(weights, interventions, goes)
+    return PolicyEquation(source, weights, None if every_rate else fastest, interventions.without_costs)
 
 
-def with_changes(weights: Rates, goes: Sequence[jax.Array]) -> Rates:
-    """The weights with a weight of one to another mode where the mode changes by 1, ..., k − 1.
+def with_interventions(weights: Rates, interventions: Interventions, goes: Sequence[jax.Array]) -> Rates:
+    """The weights with a weight of one to the node to which an intervention leads, where ``goes`` is true.
 
-    A change of the mode is a jump at no time: V_i = c_ij + V_j, so the row reads δ_i = s + δ_j.
+    An intervention is a jump at no time: V(x) = c + V(x + o), so the row reads δ(x) = s + δ(x + o).
     """
     if not goes:
         return weights
     table = dict(zip(weights.offsets, weights.values, strict=True))
-    for k, each in enumerate(goes, start=1):
-        offset = (k, *(0 for _ in each.shape[1:]))
+    for offset, each in zip(interventions.offsets, goes, strict=True):
         table[offset] = table.get(offset, 0) + jnp.asarray(each, weights.values[0].dtype)
     return dataclasses.replace(weights, offsets=tuple(table), values=tuple(table.values()))
 

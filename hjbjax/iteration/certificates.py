@@ -19,6 +19,7 @@ exact, and require float64.
 
 import dataclasses
 import enum
+import functools
 from typing import Any
 
 import jax
@@ -151,7 +152,7 @@ def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[
 def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
     """The minimum and maximum of ρ = max(min(r/β, ψ − V), g − V)."""
     layout, value, policy, obstacles = iterate.layout, iterate.value, iterate.policy, iterate.obstacles
-    if obstacles.upper is None and obstacles.lower is None and not obstacles.switching:
+    if obstacles.upper is None and obstacles.lower is None and not obstacles.interventions:
         return layout.least(policy.defect) / discount, layout.largest(policy.defect) / discount  # without an array r/β
     shift = _shift(obstacles, policy.defect / discount, value)
     return layout.least(shift), layout.largest(shift)
@@ -160,10 +161,10 @@ def _additive(iterate: Iterate, discount: Number) -> tuple[Scalar, Scalar]:
 def _shift(obstacles: Obstacles, shift: Field, value: Field) -> Field:
     """max(min(r/β, ψ − V), g − V) from r/β, (*grid); zero at fixed nodes, where V is exact.
 
-    A change of the mode counts only where V_i = c_ij + V_j, since adding a constant to V does not reduce the rest.
+    An intervention counts only where V = M V, since adding a constant to V does not reduce M V − V.
     """
-    if obstacles.switching:
-        after = obstacles.least_after_change(value)
+    if obstacles.interventions:
+        after = obstacles.interventions.least(value)
         shift = jnp.where(value < after, shift, jnp.minimum(shift, after - value))
     if obstacles.upper is not None:
         shift = jnp.minimum(shift, obstacles.upper - value)
@@ -181,7 +182,7 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     # then anyway
     rate = jnp.where(costs, policy.defect / jnp.where(costs, least_cost, 1), jnp.sign(policy.defect) * jnp.inf)
     relative = jnp.where(free, rate, 0)
-    # where V = ψ only ψ, which is imposed, bounds V_h from above, and likewise where the mode is changed
+    # where V = ψ only ψ, which is imposed, bounds V_h from above, and likewise where V = M V
     ceiling = obstacles.ceiling(value)
     rising = relative if ceiling is None else jnp.where(value < ceiling, relative, 0)
     rho, eta = jnp.maximum(layout.largest(rising), 0), jnp.maximum(layout.largest(-relative), 0)
@@ -189,6 +190,9 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     priced = layout.largest(jnp.asarray(free & ~costs, value.dtype)) == 0
     sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # where V is flat, r = L up to rounding
     below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
+    if obstacles.interventions.pushes:  # scaling V scales c + V(x + o) the right way only for c ≥ 0
+        least_push = functools.reduce(jnp.minimum, map(jnp.min, obstacles.interventions.costs))
+        sound, priced = sound & (least_push >= 0), priced & (least_push >= 0)
     lift = jnp.maximum(-lowest_end(obstacles, counted, layout), 0)
     apart = jnp.where(jnp.isinf(above), 0, jnp.maximum(above - 1, 1 - below))  # avoids 0 · inf
     least, most = layout.least(jnp.where(counted, value, jnp.inf)), layout.largest(jnp.where(counted, value, -jnp.inf))

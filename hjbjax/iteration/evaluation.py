@@ -214,7 +214,7 @@ def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:
             f"{type(method).__name__}(...) relaxes node by node, which does not converge with open ends; "
             "use hjb.PolicyIteration(hjb.Direct()) or Krylov(), in a march Implicit(hjb.Direct())"
         )
-    delta = _with_exact_changes(equation, grid, method.solve(equation, grid))
+    delta = _with_exact_interventions(equation, method.solve(equation, grid))
     if method.rough:  # its residual is checked in the next step
         return delta
     size, left = (grid.layout.largest(jnp.abs(each)) for each in (equation.source, left_over(equation, grid, delta)))
@@ -222,14 +222,11 @@ def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:
     return jax.lax.cond(left <= size, lambda: delta, lambda: relaxed(equation, grid, 2))
 
 
-def _with_exact_changes(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
-    """The correction with δ_i = s + δ_j in the rows of a change of the mode, which an approximate solve misses."""
-    jumps = zip(equation.weights.offsets, equation.weights.values, strict=True)
-    modes = [(offset, weight) for offset, weight in jumps if grid.modes and offset[0]]
-    for _ in modes:  # a row may lead to a row of another change
-        for offset, weight in modes:
-            delta = jnp.where(weight == 1, equation.source + stencil.neighbour(delta, grid, offset), delta)
-    return delta
+def _with_exact_interventions(equation: PolicyEquation, delta: Field) -> Field:
+    """The correction with δ(x) = s + δ(x + o) in the rows of an intervention, which an approximate solve misses."""
+    table = dict(zip(equation.weights.offsets, equation.weights.values, strict=True))
+    goes = [table[offset] == 1 for offset in equation.interventions.offsets]
+    return equation.interventions.followed(goes, equation.source, delta)
 
 
 def left_over(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:

@@ -401,7 +401,12 @@ def _rates_in_program(problem: Problem, grid: Grid, actions: tuple, scheme: Chai
 
 
 def _refuse_changes(problem: Problem) -> None:
-    """Refuse changes of the mode by the controller, which a policy does not hold."""
+    """Refuse pushes, and changes of the mode by the controller, which a policy does not hold."""
+    if problem.push_steps:
+        raise ValueError(
+            "chain: got a problem with pushes, which move the state at once; a policy does not hold them, so the rates "
+            "would\nlack them. Leave out pushes"
+        )
     if problem.switching_costs is not None:
         raise ValueError(
             "chain: got modes with a switching_cost; a policy does not hold changes of the mode by the controller,\n"

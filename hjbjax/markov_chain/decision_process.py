@@ -124,6 +124,11 @@ def action_table(problem: Problem) -> np.ndarray:
     if is_constrained(problem):
         what = problem.labels.word("a stopping_cost or running_max")
         raise ValueError(f"transition_arrays: got {what}, which a decision problem cannot hold")
+    if problem.push_steps:
+        raise ValueError(
+            "transition_arrays: got a problem with pushes, which take effect at once, while an action of a decision "
+            "problem\ntakes a time step; leave out pushes, or bound the speed of the motion by a control"
+        )
     if problem.switching_costs is not None:
         raise ValueError(
             "transition_arrays: got modes with a switching_cost, which takes effect at once, while an action of a "

@@ -18,13 +18,13 @@ from hjbjax.plotting.slices import (
     Section,
     at_states,
     at_time,
+    decided_sets,
     described,
     feedback,
     line_in_box,
     region_of,
     section_of,
     span_of,
-    stopping_of,
     target_of,
     without_jumps,
     zeros,
@@ -56,7 +56,7 @@ def value(
 ) -> Picture:
     """Plot the value function: a line over one axis, colours with contour lines over two axes.
 
-    The set where it is optimal to stop is dotted, up to the free boundary; see ``Solution.free_boundary``.
+    The set where it is optimal to stop, or to push, is dotted, up to the free boundary; see ``Solution.free_boundary``.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
@@ -104,9 +104,9 @@ def value(
 
 
 def _stopped(ax: Axes, solution: Solution, section: Section, time: float | None) -> list[Artist]:
-    """Draw the stopping set of the solution, if there is one."""
-    found = stopping_of(solution, section, time)
-    return [] if found is None else stopped(ax, section, *found)
+    """Draw the stopping set and the push region of the solution, if there are any."""
+    found = decided_sets(solution, section, time)
+    return [artist for name, each in found.items() for artist in stopped(ax, section, *each, name)]
 
 
 def _without(section: Section, target: Callable[[State], Number] | None) -> tuple[Section, tuple[Region, ...]]:

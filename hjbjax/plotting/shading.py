@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 FLAT = 1e-4  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
 HATCH, DOTS, STROKE = "////", "..", "#909090"
-STOP = "stop"  # the label of the stopping set
 EXTREME = 1e-6  # fraction of the range: a control closer to its end counts as being there
 JUMPING = 0.9  # fraction of nodes at an end of the range, or at zero, that identifies a feedback that jumps
 
@@ -180,12 +179,13 @@ def outlined(ax: Axes, region: Region, *, inside: bool = True) -> list[Artist]:
     return artists
 
 
-def stopped(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray) -> list[Artist]:
-    """Dot the part of a section where it is optimal to stop, up to the free boundary, with an entry in the legend.
+def stopped(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray, name: str) -> list[Artist]:
+    """Dot the part of a section where it is optimal to stop or push, up to the free boundary, and name it.
 
     Args:
-      inside: True for nodes of the stopping set, of the shape of the section.
+      inside: True for nodes of the set, of the shape of the section.
       values: V at the same nodes.
+      name: the label of the set.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
@@ -194,12 +194,12 @@ def stopped(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray) 
         return []
     style: dict[str, Any] = {"facecolor": "none", "edgecolor": STROKE, "hatch": DOTS}
     artists: list[Artist] = []
-    named = STOP in ax.get_legend_handles_labels()[1]  # several modes may be drawn on the same axes
+    named = name in ax.get_legend_handles_labels()[1]  # several modes may be drawn on the same axes
     if len(section.axes) == 1:
         (x,) = section.coordinates
         ends = [*x[:1][inside[:1]], *points_of(x, values, inside, None), *x[-1:][inside[-1:]]]
         for k, (left, right) in enumerate(zip(ends[::2], ends[1::2], strict=True)):
-            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k or named else STOP, **style))
+            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k or named else name, **style))
     else:
         area: Any = {"levels": [0.0, 1.0], "colors": "none", "hatches": [DOTS], "zorder": 2}
         dots = ax.contourf(*section.coordinates, inside.T - 0.5, **area)
@@ -207,7 +207,7 @@ def stopped(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray) 
         segments = segments_of(section.coordinates, values, inside, (None, None))
         artists += [dots, ax.add_collection(LineCollection(list(segments), colors="black", linewidths=1.0, zorder=2.5))]
         corner = (float(section.coordinates[0][0]), float(section.coordinates[1][0]))
-        ax.add_patch(Rectangle(corner, 0, 0, linewidth=0.6, label=STOP, **style))
+        ax.add_patch(Rectangle(corner, 0, 0, linewidth=0.6, label=name, **style))
     legend(ax)
     return artists
 

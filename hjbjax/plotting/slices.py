@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 # coordinates by axis number or name; three types, because a type checker does not accept {0: 1.0} for the last one
 Cuts: TypeAlias = Mapping[int, float] | Mapping[str, float] | Mapping[int | str, float]
+STOP, PUSH = "stop", "push"  # the labels of the stopping set and of the push region
 CHUNK = 1 << 16  # number of states evaluated at once, to bound the memory of intermediate arrays
 RASTER = 301  # points per axis for the outline of a set; a disc a tenth of the plot wide has 30 across
 ON_NODE = 1e-9  # fraction of a cell: a coordinate this close to a node means the node, so 0.1 + 0.2 means 0.3
@@ -62,6 +63,7 @@ class Described(NamedTuple):
     problem: Any = None  # a Problem, or a stand-in of the user
     discrete: bool = False  # the mean of two enumerated controls may not be admissible
     stopping: Array | None = None  # the nodes where it is optimal to stop
+    pushing: Array | None = None  # the nodes where each push is optimal
 
 
 def described(solution: "Solution | None") -> Described:
@@ -119,22 +121,29 @@ def target_of(solution: "Solution", time: float | None = None) -> Callable[[Stat
     return lambda x: problem.target(moment, x)
 
 
-def stopping_of(
+def decided_sets(
     solution: "Solution", section: Section, time: float | None = None
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The stopping set in the plane of a section, bool, and V there; None if there is no set, and for tubes.
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """The stopping set and the push region in the plane of a section, bool, and V there, by name; none for tubes.
 
     A tube without running cost and noise is drawn by its level sets, and its paths do not stop.
     """
     known = described(solution)
-    if known.stopping is None or (known.problem is not None and is_tube(known.problem)):
-        return None
+    if known.problem is not None and is_tube(known.problem):
+        return {}
     cuts: Cuts = section.cuts
-    inside, value = (
-        section_of("value", at_time(solution, np.asarray(field, float), time)[0], section.grid, cuts, "", nearest=True)
-        for field in (known.stopping, solution.value)
-    )
-    return inside.values.data > 0.5, value.values.data
+    pushed = None if known.pushing is None else np.any(known.pushing, axis=-1)
+    found = {}
+    for name, mask in ((STOP, known.stopping), (PUSH, pushed)):
+        if mask is not None:
+            inside, value = (
+                section_of(
+                    "value", at_time(solution, np.asarray(f, float), time)[0], section.grid, cuts, "", nearest=True
+                )
+                for f in (mask, solution.value)
+            )
+            found[name] = inside.values.data > 0.5, value.values.data
+    return found
 
 
 def sets_of(solution: "Solution", time: float | None = None) -> dict[str, Callable[[State], Number]]:

@@ -18,6 +18,7 @@ from hjbjax.problem.jump_terms import OF_JUMPS
 from hjbjax.problem.jumps import Jump
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import PAYMENTS, Problem
+from hjbjax.problem.pushes import Push, marginal_costs
 from hjbjax.problem.pytree import REMEMBERED, altered, as_partial, is_traced
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Array, Number
@@ -29,11 +30,13 @@ def in_mode(problem: Problem, mode: int) -> Problem:
     """The problem in one mode, without changes of the mode."""
     names = ("drift", "cost", "noise", *OF_STATE, *PAYMENTS, "discount", "controls")
     fixed = {name: _in_mode(each, mode) for name in names if callable(each := getattr(problem, name))}
-    return altered(problem, modes=None, jumps=tuple(_jump_in_mode(jump, mode) for jump in problem.jumps), **fixed)
+    jumps = tuple(_jump_in_mode(jump, mode) for jump in problem.jumps)
+    pushes = tuple(_push_in_mode(push, mode) for push in problem.pushes)
+    return altered(problem, modes=None, jumps=jumps, pushes=pushes, **fixed)
 
 
 def over_modes(problem: Problem, n: int) -> Problem:
-    """The problem whose state begins with the mode; unchanged if it has no modes.
+    """The problem whose state begins with the mode, and whose pushes are one function; unchanged without both.
 
     Args:
       problem: the problem, with costs.
@@ -46,13 +49,16 @@ def over_modes(problem: Problem, n: int) -> Problem:
       >>> joined.drift(z, None).tolist(), joined.mode_rates(z, None).tolist()
       ([0.0, -10.0], [4.0])
     """
+    if problem.pushes:
+        steps = tuple(push.step for push in problem.pushes)
+        problem = altered(problem, pushes=(), push_costs=marginal_costs(problem.pushes), push_steps=steps)
     modes = problem.modes
     if modes is None:
         return problem
     count, place = len(modes.names), int(problem.time_dependent)
     fixed = {
         name: _over(each, count, place)
-        for name in ("cost", *OF_STATE, *OF_JUMPS, "discount", "controls")
+        for name in ("cost", *OF_STATE, *OF_JUMPS, "push_costs", "discount", "controls")
         if callable(each := getattr(problem, name))
     }
     rates, costs = modes.rates, modes.switching_cost
@@ -63,6 +69,7 @@ def over_modes(problem: Problem, n: int) -> Problem:
         noise=_noise(problem.noise, n, count, place),
         mode_rates=None if rates is None else _table(rates, count, place),
         switching_costs=None if costs is None else _table(costs, count, place),
+        push_steps=tuple((axis + 1, step) for axis, step in problem.push_steps),
         **fixed,
     )
 
@@ -104,6 +111,12 @@ def without_modes(grid: Grid) -> Grid:
     rest = {name: getattr(grid, name)[1:] for name in fields}
     faces = jax.tree.map(lambda end: end[0] if np.ndim(end) else end, grid._faces[1:])
     return altered(grid, modes=(), _faces=faces, **rest)
+
+
+def _push_in_mode(push: Push, mode: int) -> Push:
+    """A push in one mode."""
+    names = [name for name in ("cost", "reward") if callable(getattr(push, name))]
+    return altered(push, **{name: _in_mode(getattr(push, name), mode) for name in names})
 
 
 def _in_mode(function: jax.tree_util.Partial, mode: int) -> jax.tree_util.Partial:
@@ -216,15 +229,20 @@ def _of_mode(function: Callable, numbers: Array, *arguments: Any) -> Array:
 
 
 def refuse_modes(problem: Problem) -> None:
-    """Refuse a problem with modes or jumps in a function that does not support them.
+    """Refuse a problem with modes, jumps or pushes in a function that does not support them.
 
     Raises:
-      ValueError: the problem has modes or jumps.
+      ValueError: the problem has modes, jumps or pushes.
     """
     if problem.jumps:
         raise ValueError(
             f"Problem.jumps: got a problem with {len(problem.jumps)} jumps, which this function does not take; wanted "
             "a problem without jumps"
+        )
+    if problem.pushes:
+        raise ValueError(
+            f"Problem.pushes: got a problem with {len(problem.pushes)} pushes, which this function does not take; "
+            "wanted a problem\nwithout pushes: they move the state at once, not in time. Leave out pushes"
         )
     if problem.modes is not None:
         raise ValueError(

@@ -19,6 +19,7 @@ from hjbjax.problem import labels as labelling
 from hjbjax.problem.jumps import Jump
 from hjbjax.problem.labels import COST, REWARD, Labels
 from hjbjax.problem.modes import Modes
+from hjbjax.problem.pushes import Push, check_pushes
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, AnyControl, Ball, Box, Finite, Simplex
 from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
@@ -29,7 +30,9 @@ PAYMENTS = {  # the payments of a problem with rewards, and the same payments as
     "terminal_reward": "terminal_cost",
     "stopping_reward": "stopping_cost",
 }
-STATIC = ("isaacs", "time_dependent", "control_names", "control_units", "inside", "discounted", "payoff")
+STATIC = (
+    "isaacs", "time_dependent", "control_names", "control_units", "inside", "discounted", "payoff", "push_steps",
+)  # fmt: skip
 
 
 @pytree_dataclass(static=STATIC)
@@ -71,6 +74,9 @@ class Problem:
       modes: the regimes between which the system changes at random or by choice, see ``Modes``. Values then have the
         shape (k, *grid).
       jumps: sudden moves of the state at random times, a list of ``Jump``.
+      pushes: directions in which the controller may move the state at once, at a cost or a reward per unit of length,
+        see ``Push``. The costs and rewards keep their meaning in a problem of either kind. A problem that has only
+        rewards for pushes is a problem with rewards.
       isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min. With rewards
         the disturbance also sees u if ``"upper"``: max over u of min over d.
       time_dependent: True if the functions take the time as their first argument.
@@ -105,6 +111,7 @@ class Problem:
     running_max: Any = None
     modes: Modes | None = None
     jumps: tuple[Jump, ...] = ()
+    pushes: tuple[Push, ...] = ()
     isaacs: str = "upper"
     time_dependent: bool = False
     control_names: tuple[str, ...] = ()
@@ -125,6 +132,9 @@ class Problem:
     intensities: Any = dataclasses.field(init=False, default=None, repr=False)
     landings: Any = dataclasses.field(init=False, default=None, repr=False)
     jump_costs: Any = dataclasses.field(init=False, default=None, repr=False)
+    # the pushes as one function of the state, see ``mode_axis``, and the axis and the sign of each
+    push_costs: Any = dataclasses.field(init=False, default=None, repr=False)
+    push_steps: tuple[tuple[int, int], ...] = dataclasses.field(init=False, default=(), repr=False)
 
     def __init__(
         self,
@@ -142,6 +152,7 @@ class Problem:
         running_max: Callable | None = None,
         modes: Modes | None = None,
         jumps: Sequence[Jump] = (),
+        pushes: Sequence[Push] = (),
         isaacs: str = "upper",
         time_dependent: bool = False,
         control_names: Sequence[str] = (),
@@ -167,11 +178,12 @@ class Problem:
             raise TypeError(f"Problem.modes: got {modes!r}, wanted hjb.Modes(('low', 'high'), rates=...)")
         if not isinstance(jumps, (list, tuple)) or not all(isinstance(jump, Jump) for jump in jumps):
             raise TypeError(f"Problem.jumps: got {jumps!r}, wanted a list, as in [hjb.Jump(rate, landing)]")
+        pushes = check_pushes(pushes)
         # with a running maximum, V ≥ g, there is no integral to discount, so β V − L has no meaning
-        if running_max is not None and (cost is not None or _is_nonzero(discount)):
+        if running_max is not None and (cost is not None or pushes or _is_nonzero(discount)):
             raise ValueError(
                 "Problem.running_max: the cost is only the running maximum; "
-                "leave out cost and discount, or put the running cost into a stopping_cost"
+                "leave out cost, pushes and discount, or put the running cost into a stopping_cost"
             )
         costs = {
             "cost": cost, "exit_cost": exit_cost, "terminal_cost": terminal_cost, "stopping_cost": stopping_cost,
@@ -180,7 +192,7 @@ class Problem:
             "reward": reward, "exit_reward": exit_reward, "terminal_reward": terminal_reward,
             "stopping_reward": stopping_reward,
         }  # fmt: skip
-        payoff = _payoff(costs | {"running_max": running_max}, rewards)
+        payoff = _payoff(costs | {"running_max": running_max}, rewards, pushes)
         for name, paid in {"exit_cost": exit_cost, "exit_reward": exit_reward}.items():
             if paid is not None and target is None:
                 raise ValueError(f"Problem.{name}: there is no target to pay it on; give target as well")
@@ -196,6 +208,7 @@ class Problem:
             "running_max": as_partial(running_max, "Problem.running_max"),
             "modes": modes,
             "jumps": tuple(jumps),
+            "pushes": pushes,
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
             "control_names": words.controls,
@@ -210,6 +223,8 @@ class Problem:
             "intensities": None,
             "landings": None,
             "jump_costs": None,
+            "push_costs": None,
+            "push_steps": (),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -267,9 +282,11 @@ def is_constrained(problem: Problem) -> bool:
     return problem.stopping_cost is not None or problem.running_max is not None
 
 
-def _payoff(costs: dict[str, Any], rewards: dict[str, Any]) -> str:
-    """The word for the payments of a problem, "cost" or "reward"; refuses both together."""
+def _payoff(costs: dict[str, Any], rewards: dict[str, Any], pushes: Sequence[Push]) -> str:
+    """The word for the payments of a problem, "cost" or "reward"; refuses both together, except in pushes."""
     paid, earned = ([name for name, given in each.items() if given is not None] for each in (costs, rewards))
+    if not paid and not earned and any(push.reward is not None for push in pushes):
+        return REWARD
     if not earned:
         return COST
     if not paid:

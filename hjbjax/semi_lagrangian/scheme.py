@@ -97,6 +97,7 @@ class SemiLagrangian(Scheme, Paths):
         for present, what in (
             (bool(grid.modes), "a problem with modes"),
             (problem.landings is not None, "a problem with jumps"),
+            (bool(problem.push_steps), "a problem with pushes"),
             (problem.noise is not None, "a problem with noise: its paths spread"),
             (problem.is_game, "a game: the disturbance would have to answer in the middle of an arc"),
             (problem.running_max is not None, "a running_max: the maximum is evaluated at nodes only"),

@@ -84,6 +84,7 @@ def plan(header: dict) -> dict[str, Expected]:
         "reached": Expected((shape, lead + shape), (np.bool_,)),
         "stopping": Expected((lead + shape,), (np.bool_,)),
         "active": Expected((lead + shape,), (np.bool_,)),
+        "pushing": Expected((lead + shape + many,), (np.bool_,)),
         "grid_error": Expected((shape, lead + shape)),
         "box_error": Expected((shape, lead + shape)),
         "residuals": Expected((many,)),
@@ -126,7 +127,8 @@ def dataset(solution: Any) -> "xarray.Dataset":
     except ImportError:
         raise ImportError("Solution.to_xarray needs xarray: pip install 'hjbjax[io]'") from None
     grid, labels, marched = solution.grid, solution.labels, solution.times is not None
-    own = ["value", "grid_error", "box_error", "reached", "stopping", "active", "time", "control", "disturbance"]
+    own = ["value", "grid_error", "box_error", "reached", "stopping", "active", "pushing", "time"]
+    own += ["control", "disturbance"]
     names = [f"state {name}" if name in own else name for name in grid.names]
     lead = ("time",) if marched else ()
     found: dict[str, Any] = {"value": ((*lead, *names), solution.value, {"long_name": labels.long_name})}
@@ -141,6 +143,9 @@ def dataset(solution: Any) -> "xarray.Dataset":
         array = getattr(solution, name)
         if array is not None:
             found[name] = ([*lead, *names][-np.ndim(array) :], array, {"long_name": about})
+    for j in range(0 if solution.pushing is None else np.shape(solution.pushing)[-1]):
+        pushed = {"long_name": f"push {j} is optimal"}
+        found[f"pushing {j}"] = ((*lead, *names), np.asarray(solution.pushing)[..., j], pushed)
     for kind, array in (("control", solution.policy), ("disturbance", solution.disturbance)):
         count = 0 if array is None else np.shape(array)[-1]
         for j in range(count):

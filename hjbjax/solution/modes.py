@@ -14,7 +14,9 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Numbers
 
 SAME = 64  # units in the last place between V and the value after a change of the mode
-BY_NODE = ("value", "policy", "disturbance", "reached", "grid_error", "box_error", "stopping", "active")
+BY_NODE = (
+    "value", "policy", "disturbance", "reached", "grid_error", "box_error", "stopping", "active", "pushing",
+)  # fmt: skip
 
 
 def states_in_mode(grid: Grid, x: Numbers, mode: str | int, name: str) -> Array:

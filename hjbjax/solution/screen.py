@@ -41,6 +41,8 @@ class _Answer(Protocol):
     @property
     def stopping(self) -> Array | None: ...
     @property
+    def pushing(self) -> Array | None: ...
+    @property
     def steps(self) -> int: ...
     @property
     def residual(self) -> float | None: ...
@@ -82,7 +84,8 @@ def show(solution: _Answer) -> str:
         "reached": f"{percent(reached)} of the nodes" if reached < 1 else "",
         "cut": _cuts(solution),
         "bounds": number(stats.get("bounds", "")),
-        "stopping": _stopping(solution),
+        "stopping": _share(solution, solution.stopping),
+        "pushing": _share(solution, None if solution.pushing is None else solution.pushing.any(axis=-1)),
         "isaacs gap": "" if solution.isaacs_gap is None else number(solution.isaacs_gap),
         "seconds": f"{number(stats['seconds'])}{compiling}" if "seconds" in stats else "",
         "memory": size(stats["bytes"]) if "bytes" in stats else "",
@@ -148,11 +151,11 @@ def _cuts(solution: _Answer) -> str:
     return f"drift out of the box, nodes at the ends: {ends}"
 
 
-def _stopping(solution: _Answer) -> str:
-    """The share of the nodes where it is optimal to stop, at the earliest kept time."""
-    if solution.stopping is None:
+def _share(solution: _Answer, mask: Any) -> str:
+    """The share of the nodes where it is optimal to stop or to push, at the earliest kept time."""
+    if mask is None:
         return ""
-    first = solution.stopping if solution.times is None else solution.stopping[0]
+    first = mask if solution.times is None else mask[0]
     return f"optimal at {percent(float(np.mean(np.asarray(first))))} of the nodes"
 
 

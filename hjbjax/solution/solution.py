@@ -88,6 +88,8 @@ class Solution:
         ``None`` without a stopping payment, and if only V is stored.
       active: the nodes where the running maximum is attained, V = g, like ``stopping``; ``None`` without
         ``running_max``.
+      pushing: the nodes where each of the ``pushes`` is optimal, bool (*grid, p) or (k, *grid, p). Ties count. ``None``
+        without pushes, and if only V is stored.
       discrete: True if the controls are enumerated, so that the mean of two need not be admissible.
       discrete_disturbance: True if the disturbances are enumerated.
       labels: names and units of the controls, the side of the level set, and whether V is a cost or a reward.
@@ -123,6 +125,7 @@ class Solution:
     cut: Any = None
     stopping: Any = None
     active: Any = None
+    pushing: Any = None
     discrete: bool = False
     discrete_disturbance: bool = False
     labels: Labels = Labels()
@@ -296,13 +299,14 @@ class Solution:
         return found
 
     def free_boundary(self, inside: Any = None, *, time: float | None = None) -> np.ndarray:
-        """The boundary of the stopping set between the nodes: points over one axis, segments over two.
+        """The boundary of the stopping set or push region between the nodes: points over one axis, segments over two.
 
         If V leaves ψ smoothly (smooth pasting) or at an angle, the error is of second order in the spacing; otherwise
         it is half a cell.
 
         Args:
-          inside: another set of nodes, such as ``active`` of the same solution; a mask like ``stopping``.
+          inside: another set of nodes, such as ``active`` or ``pushing[..., 0]`` of the same solution; a mask like
+            ``stopping``. Default: the stopping set, or without one the nodes at which any push is optimal.
           time: for a marched solution, the kept time nearest to which the boundary is computed; ``None`` is the
             earliest.
 
@@ -311,7 +315,8 @@ class Solution:
           the box are not part of the boundary.
 
         Raises:
-          ValueError: there is no stopping set, the grid has more than two axes, or ``time`` for a stationary solution.
+          ValueError: there is neither a stopping set nor a push region, the grid has more than two axes, or ``time``
+            for a stationary solution.
 
         Example:
           >>> import jax.numpy as jnp, hjbjax as hjb  # stop at a price of x², or wait for a rate of 1
@@ -321,12 +326,14 @@ class Solution:
           [-1.0, 1.0]
         """
         inside = self.stopping if inside is None else inside
+        if inside is None and self.pushing is not None:
+            inside = self.pushing.any(axis=-1)
         if is_traced(self, inside):
             raise ValueError("Solution.free_boundary: got a traced solution; call it outside of jit, vmap and grad")
         if inside is None:
             raise ValueError(
-                "Solution.free_boundary: this solution has no stopping set; wanted a problem with a stopping_cost or a "
-                "stopping_reward,\nsolved with its policy, or another set such as solution.active"
+                "Solution.free_boundary: this solution has no stopping set; wanted a problem with a stopping_cost, a "
+                "stopping_reward or pushes,\nsolved with its policy, or another set such as solution.active"
             )
         if time is not None and self.times is None:
             raise ValueError(

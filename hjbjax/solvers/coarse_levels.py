@@ -99,7 +99,11 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
         # data at all nodes restricts to every second node
         every = tuple(slice(None, None, stride) for stride, _ in strides)
         # leave out problem and grid, whose leaves may have the shape of the nodes by chance
-        bare: Any = dataclasses.replace(task, on=None)  # type: ignore[arg-type]
+        obstacles = task.obstacles
+        if obstacles.interventions:  # the cost of a push depends on the spacing
+            longer = obstacles.interventions.over([stride for stride, _ in strides])
+            obstacles = dataclasses.replace(obstacles, interventions=longer)
+        bare: Any = dataclasses.replace(task, on=None, obstacles=obstacles)  # type: ignore[arg-type]
         known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
         on = task.on.on_grid(coarse)
         made = dataclasses.replace(known, on=_with_links(on) if stores_links(on) else on)

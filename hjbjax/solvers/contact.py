@@ -1,4 +1,4 @@
-"""The nodes where a constraint holds with equality: V = ψ, where it is optimal to stop, and V = g.
+"""The nodes where a constraint holds with equality: V = ψ, where it is optimal to stop, V = g, and V = c + V(x + o).
 
 In a solve the residual is max(min(s, ψ − V), g − V) with s = r/(Q + β). A node belongs to the stopping set if ψ − V is
 the branch that counts, and to the set of the running maximum if g − V is. The distance from V to ψ alone does not
@@ -32,7 +32,9 @@ ROUNDING = 16  # units of eps of |ψ|: a smaller distance from V to ψ is roundi
 def contact(
     problem: Problem, grid: Grid, obstacles: Obstacles, value: Nodes, residual: Field | Number = 0
 ) -> dict[str, Any]:
-    """The stopping set and the set of the running maximum, as fields of a Solution; bool (*grid) each.
+    """The stopping set and the set of the running maximum, bool (*grid), and the push regions, bool (*grid, p).
+
+    The keys are the names of fields of a Solution.
 
     A tie counts: it is optimal to stop where continuing costs the same. A node with an infinite ψ never stops. Paths
     have ended at a node of the target; if V = ψ there, it belongs to the set together with a neighbour outside of the
@@ -58,6 +60,11 @@ def contact(
         limit = jnp.where(known, limit, 0)
         touches = known & (jnp.abs(limit - jnp.where(known, value, 0) - residual) <= eps * jnp.abs(limit))
         found[name] = _with_neighbours(touches, grid, obstacles)
+    if problem.push_steps:
+        pushes = obstacles.interventions
+        after = jnp.stack(pushes.after(value)[pushes.changes :], axis=-1)
+        gap = after - (value + residual)[..., None]
+        found["pushing"] = (gap <= eps * jnp.abs(after)) & jnp.isfinite(after) & ~obstacles.fixed[..., None]
     return found
 
 
@@ -71,24 +78,30 @@ def _with_neighbours(touches: jax.Array, grid: Grid, obstacles: Obstacles) -> ja
     return free | (touches & beside)
 
 
-def has_contact(problem: Problem) -> dict[str, bool]:
-    """The sets of ``contact`` that a problem has."""
-    return {"stopping": problem.stopping_cost is not None, "active": problem.running_max is not None}
+def contact_axes(problem: Problem) -> dict[str, tuple[int, ...]]:
+    """The sets of ``contact`` that a problem has, with the axes of their masks after those of the nodes."""
+    there = {
+        "stopping": problem.stopping_cost is not None, "active": problem.running_max is not None,
+        "pushing": bool(problem.push_steps),
+    }  # fmt: skip
+    return {name: (len(problem.push_steps),) * (name == "pushing") for name, has in there.items() if has}
 
 
 def contact_of_solve(task: Task, state: State) -> dict[str, Any]:
     """The sets of ``contact`` for a solve, in NumPy; empty without constraints, and if only V is stored."""
-    if not any(has_contact(task.problem).values()) or task.bare:
+    axes = contact_axes(task.problem)
+    if not axes or task.bare:
         return {}
     found = jax.device_get(_of_task(task, state))
-    return {name: np.array(np.broadcast_to(mask, task.grid.shape)) for name, mask in found.items()}
+    return {name: np.array(np.broadcast_to(mask, task.grid.shape + axes[name])) for name, mask in found.items()}
 
 
 @jax.jit
 def _of_task(task: Task, state: State) -> dict[str, Any]:
     equation = task.equation(state.value, state.policy, state.fastest)
     found = contact(task.problem, task.grid, task.obstacles, state.value, equation.source)
-    found = {name: mask & task.counted for name, mask in found.items()}
+    counted = task.counted[..., None]
+    found = {name: mask & (counted if name == "pushing" else task.counted) for name, mask in found.items()}
     if "stopping" in found and task.problem.noise is not None:
         left = found["stopping"] & ~_gaining(task, state, found["stopping"])
         found["stopping"] = _with_neighbours(left, task.grid, task.obstacles)

@@ -18,7 +18,7 @@ from hjbjax.solution.clock import CUT, Clock
 from hjbjax.solution.solution import Solution, attach_solution, question
 from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop
-from hjbjax.solvers.contact import contact, has_contact
+from hjbjax.solvers.contact import contact, contact_axes
 from hjbjax.solvers.host_loop import WideJit
 from hjbjax.solvers.result import active_bounds, isaacs_gap, warn_of_gap
 from hjbjax.well_posedness import node_checks
@@ -110,9 +110,9 @@ class Slices:
         self.value = np.empty((len(kept), *shape), dtype)
         self.policy, self.disturbance = (np.empty((len(kept), *shape, size), dtype) for size in sizes)
         self.cut, self.ends = (np.zeros((len(kept), len(shape), 2), int) for _ in range(2))
-        sets = {} if task.bare else has_contact(problem)
+        sets = {} if task.bare else contact_axes(problem)
         self.touching: dict[str, Any] = {
-            name: np.zeros((len(kept), *shape), bool) for name, there in sets.items() if there
+            name: np.zeros((len(kept), *shape, *more), bool) for name, more in sets.items()
         }
         self.first = len(kept)  # index of the first filled slice; decreases, as the march goes backward in time
 

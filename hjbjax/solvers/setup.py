@@ -269,6 +269,8 @@ def prepare_on_host(
         task = dataclasses.replace(task, certificate=Certificate.NONE, least_cost=None)
     held = np.asarray(task.obstacles.fixed)
     undiscounted = problem.discount == 0
+    if undiscounted:
+        _refuse_earning_pushes(task)
     endless_costs.ill_posed(problem, bool(assumptions.may_rest and held.any()), grid)
     # a game is searched only if it fails, because all pairs of actions are expensive; a constraint makes all values
     # finite
@@ -278,6 +280,17 @@ def prepare_on_host(
     if undiscounted and not reach.surely.all():
         task = _finite_part(task, reach.surely)
     return task, assumptions, reach
+
+
+def _refuse_earning_pushes(task: Task) -> None:
+    """Refuse pushes that earn in a problem without discount, whose value no residual bounds."""
+    pushes = task.obstacles.interventions
+    if pushes.pushes and min(float(jnp.min(cost)) for cost in pushes.costs) < 0:
+        raise ValueError(
+            "solve: got a push that earns (a reward, or a negative cost) in a problem without discount; without it the "
+            "rewards may\naccumulate forever, and no residual bounds the value. Give discount > 0, or march over a "
+            "finite horizon"
+        )
 
 
 def is_bare(method: Method) -> bool:
@@ -353,7 +366,9 @@ def _least_rate(task: Task) -> Number:
 
 def _finite_part(task: Task, reached: Mask) -> Task:
     """The task on the nodes with a finite value; other nodes get a larger value, so no optimal action leads there."""
-    obstacles = dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | ~jnp.asarray(reached))
+    lost = ~jnp.asarray(reached)
+    left = task.obstacles.interventions.avoiding(lost)
+    obstacles = dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | lost, interventions=left)
     return dataclasses.replace(task, obstacles=obstacles, counted=task.counted & jnp.asarray(reached), has_lost=True)
 
 

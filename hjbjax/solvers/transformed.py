@@ -38,7 +38,7 @@ from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
 from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, keeping_warnings
 from hjbjax.solvers import host_loop, memory
-from hjbjax.solvers.contact import has_contact
+from hjbjax.solvers.contact import contact_axes
 from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
 from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain, finish_arcs
@@ -230,7 +230,7 @@ def _shapes(on: Discretisation, *, may_follow: bool, bare: bool) -> Found:
         array(*shape), Greedy(array(*shape), *players), mask, mask, number, count, count,
         array(dtype=np.dtype(bool)), array(2, 2), number,
         array(dtype=np.dtype(bool)) if may_follow else None, array(*shape, dtype=count.dtype) if may_follow else None,
-        {} if bare else {name: mask for name, there in has_contact(on.problem).items() if there},
+        {} if bare else {name: array(*shape, *p, dtype=mask.dtype) for name, p in contact_axes(on.problem).items()},
     )  # fmt: skip
 
 
@@ -302,9 +302,11 @@ def _solved(
 
 def _touching(solution: Solution, problem: Problem) -> dict[str, np.ndarray]:
     """The sets of the solution that the problem has; empty sets if the solve failed."""
-    nowhere = np.zeros(solution.grid.shape, bool)
-    found = {name: getattr(solution, name) for name, there in has_contact(problem).items() if there}
-    return {name: nowhere if mask is None else mask for name, mask in found.items()}
+    axes, found = contact_axes(problem), {}
+    for name, more in axes.items():
+        mask = getattr(solution, name)
+        found[name] = np.zeros(solution.grid.shape + more, bool) if mask is None else mask
+    return found
 
 
 def _found_on_arcs(followed: Followed) -> Found:

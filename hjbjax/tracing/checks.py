@@ -29,6 +29,7 @@ RATES = ("discount", "killing")
 USERS_NAMES = {
     "killing": "discount", "mode_rates": "Modes.rates", "switching_costs": "Modes.switching_cost",
     "intensities": "Jump.rate", "landings": "Jump.landing",
+    "push_costs": "Push.cost",
 }  # fmt: skip
 
 _ADVICE = (  # most specific first, since TracerBoolConversionError is a ConcretizationTypeError
@@ -364,8 +365,8 @@ def over_devices(
         return None
     if traced:
         raise ValueError(f"{caller}: mesh divides the nodes at host level only; leave it out inside jit, vmap and grad")
-    if grid.modes:
-        raise ValueError(f"{caller}: a problem with modes is solved on one device; leave out mesh")
+    if grid.modes or problem.push_steps:
+        raise ValueError(f"{caller}: a problem with modes or pushes is solved on one device; leave out mesh")
     if problem.landings is not None:
         raise ValueError(f"{caller}: a problem with jumps is solved on one device; leave out mesh")
     refuse_prescribed(grid, caller, "whose numbers are not divided over a mesh")

@@ -158,25 +158,26 @@ def reached(
     # exactly to a path. Every pass uses admissible actions only, so the union of the passes is also reachable.
     for count, kinks in dict.fromkeys([(few, False), (len(points), False), (len(points), True)]):
         jumps = functools.partial(_open_jumps, on, points=points, count=count, clock=clock, least=least, kinks=kinks)
-        more = _reached_by(jumps, _changes(on), held, surely, on.grid, clock)
+        more = _reached_by(jumps, _interventions(on), held, surely, on.grid, clock)
         found, maybe = found | more.surely, maybe | more.maybe
         if found.all():
             break
     return Reach(found, maybe)
 
 
-def _changes(on: Discretisation) -> Rates:
-    """The changes of the mode that the controller may make, as jumps, bool (*grid) each."""
-    costs = _switching_costs(on) if on.problem.switching_costs is not None else []
-    offsets = (stencil.unit(on.grid, 0, k) for k in range(1, len(costs) + 1))
-    return Rates(tuple(offsets), tuple(np.isfinite(np.asarray(cost)) for cost in costs))
+def _interventions(on: Discretisation) -> Rates:
+    """The interventions that the controller may choose, as jumps, bool (*grid) each."""
+    if on.problem.switching_costs is None and not on.problem.push_steps:
+        return Rates((), ())
+    found = _interventions_jit(on)
+    return Rates(found.offsets, tuple(np.asarray(cost) < np.inf for cost in found.costs))
 
 
-_switching_costs = jax.jit(Discretisation.switching_costs)
+_interventions_jit = jax.jit(Discretisation.interventions)
 
 
 def _led_inside(changes: Rates, inside: jax.Array | None, grid: Grid) -> list[np.ndarray]:
-    """The changes of the mode that lead ``inside``, bool (*grid) each."""
+    """The interventions that lead ``inside``, bool (*grid) each."""
     if inside is None:
         return list(changes.values)
     return [
@@ -188,7 +189,7 @@ def _led_inside(changes: Rates, inside: jax.Array | None, grid: Grid) -> list[np
 def _reached_by(
     open_jumps: Callable[..., Rates], changes: Rates, held: np.ndarray, surely: bool, grid: Grid, clock: Clock
 ) -> Reach:
-    """The nodes from which the fixed nodes are reached by ``open_jumps(inside=...)`` and by changes of the mode."""
+    """The nodes from which the fixed nodes are reached by ``open_jumps(inside=...)`` and by interventions."""
 
     def staying(inside: jax.Array | None) -> np.ndarray:
         jumps = open_jumps(inside=inside)
@@ -231,7 +232,7 @@ def _controllable_predecessors(
     on: Discretisation, inside: jax.Array, found: jax.Array, least: Number
 ) -> tuple[jax.Array, Scalar]:
     """``found`` plus the nodes from which the control leads there and stays ``inside``, and a flag if any was added."""
-    problem, grid, dtype = on.problem, on.grid, on.dtype
+    problem, grid, dtype, before = on.problem, on.grid, on.dtype, found
     us, ds = (
         jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, FEW), dtype)
         for admissible in (problem.controls, problem.disturbances)
@@ -258,8 +259,10 @@ def _controllable_predecessors(
     def over(ok: jax.Array, first: jax.Array) -> tuple[jax.Array, None]:
         return (ok | answered(first) if upper else ok & answered(first)), None
 
+    for offset, cost in zip((known := on.interventions()).offsets, known.costs, strict=True):
+        found |= inside & (cost < jnp.inf) & stencil.neighbour(found, grid, offset)
     new = found | (inside & jax.lax.scan(over, jnp.full(grid.shape, not upper), outer)[0])
-    return new, jnp.any(new != found)
+    return new, jnp.any(new != before)
 
 
 def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar | None = None) -> jax.Array:

@@ -19,6 +19,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid, tabulated
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Mask, Numbers, Scalar, Verdict
 from hjbjax.solution.clock import Clock
@@ -26,6 +27,7 @@ from hjbjax.tracing import components
 from hjbjax.tracing.checks import OF_ACTION, STATE_COSTS, call
 
 ACTIONS = 33  # largest number of actions of one player, 9 per player in a game; includes ends and middle
+FREE = 1024  # units of eps of the largest cost of a push: a smaller total cost of a round trip is rounding
 LOOK = 10**7  # nodes times actions between two checks of the clock: about a second for a drift with some sines
 
 
@@ -50,6 +52,8 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
         # nearly every problem passes and skips the counts and first nodes, which are slow on a CPU
         if problem.switching_costs is not None:
             _check_round_trips(np.asarray(_switching_costs(on)), grid)
+        if problem.push_steps:
+            _check_pushes(on)
         if _all_pass(on, actions, clock):
             return
         clock.look()
@@ -110,6 +114,40 @@ def _check_round_trips(costs: np.ndarray, grid: Grid) -> None:
             "Wanted costs ≥ 0, infinity to forbid a change, and more than zero for every round trip: otherwise the "
             "controller would change the mode without end"
         )
+
+
+def _check_pushes(on: Discretisation) -> None:
+    """Refuse costs of pushes that are NaN or minus infinity, and round trips of pushes that cost nothing or earn."""
+    for fault, mask in jax.device_get(_faulty_pushes(on)).items():
+        if not mask.any():
+            continue
+        index = tuple(int(i) for i in np.argwhere(mask)[0])
+        x = on.grid.state(index)
+        where = f"at x = {_numbers(x[1:] if on.grid.modes else x)}"
+        if fault == "number":
+            raise ValueError(
+                f"Push: the cost of a push is NaN, or its reward infinite, {where}, the first of {int(mask.sum())} "
+                "nodes;\nwanted numbers per unit of length; a cost of infinity forbids a push"
+            )
+        raise ValueError(
+            f"Push: a round trip of pushes costs nothing or earns, {where}: the controller would repeat it "
+            "without end.\nWanted a positive total cost for pushing there and back, and around a periodic axis: "
+            "make a cost higher or a reward lower"
+        )
+
+
+@jax.jit
+def _faulty_pushes(on: Discretisation) -> dict[str, jax.Array]:
+    """The nodes with faulty costs of pushes, and those from which a round trip costs nothing; bool (*grid) each."""
+    found = on.interventions()
+    if on.problem.target is not None:
+        found = found.outside(on.level <= 0)
+    amiss = functools.reduce(jnp.logical_or, (~(cost > -jnp.inf) for cost in found.costs))
+    size = jnp.max(jnp.stack([jnp.max(jnp.where(jnp.isfinite(cost), jnp.abs(cost), 0)) for cost in found.costs]))
+    # a round trip that costs nothing up to rounding also earns with these lower costs, and the cheapest path is endless
+    lower = altered(found, costs=tuple(cost - FREE * jnp.finfo(on.dtype).eps * size for cost in found.costs))
+    value = lower.cheapest(jnp.zeros(on.grid.shape, on.dtype))
+    return {"number": amiss, "free": ~amiss & (lower.least(value) < value)}
 
 
 _switching_costs = jax.jit(lambda on: jnp.stack(on.switching_costs()))

@@ -11,6 +11,7 @@ under the names that the command line uses.
     (1, (81,), ())
 """
 
+from hjbjax.zoo.dividends import Reserve, dividends, dividends_exact
 from hjbjax.zoo.entry import Entry
 from hjbjax.zoo.finance import Merton, Wealth, merton, merton_exact, merton_wealth, merton_wealth_exact
 from hjbjax.zoo.geometric import Angle, CarWithTrailers, OneWay, Pomet, Unicycle
@@ -181,6 +182,15 @@ _ENTRIES = (
         duration=10.0,
     ),
     Entry(
+        "dividends",
+        "when a firm pays out its cash, until ruin",
+        dividends,
+        dividends_exact,
+        # above the barrier, so the path starts with a payment
+        start=(1.0,),
+        duration=10.0,
+    ),
+    Entry(
         "moon-landing",
         "land a rocket with the least fuel: when to start the engine",
         moon_landing,
@@ -217,6 +227,7 @@ __all__ = [
     "PlanarQuadrotor",
     "Pomet",
     "Ramsey",
+    "Reserve",
     "Saving",
     "SingleIntegrator",
     "Smooth",
@@ -232,6 +243,8 @@ __all__ = [
     "brownian_exit",
     "brownian_exit_exact",
     "catalogue",
+    "dividends",
+    "dividends_exact",
     "double_integrator",
     "double_integrator_exact",
     "double_integrator_lq",

@@ -19,7 +19,9 @@ def name_of(entry):
 
 
 def equation_residual(problem, value, x, candidates, opponents=None):
-    """β V − min_u max_d [L + f·DV + ½ tr(σσ' D²V)] at one state, over the candidates given; or V − ψ, if it is larger.
+    """β V − min_u max_d [L + f·DV + ½ tr(σσ' D²V)] at one state, over the candidates given.
+
+    The largest of this, V − ψ, and −c − DV·e for every push.
 
     A reward is minus a cost.
     """
@@ -40,6 +42,9 @@ def equation_residual(problem, value, x, candidates, opponents=None):
     else:
         best = jnp.min(jnp.max(jax.vmap(lambda u: jax.vmap(lambda d: rate(u, d))(opponents))(candidates), axis=1))
     residual = problem.discount * value(x) - best
+    for push in problem.pushes:
+        paid = push.cost if push.reward is None else -push.reward
+        residual = jnp.maximum(residual, -paid - slope @ jnp.asarray(push.direction, float))
     if problem.stopping_cost is None:
         return residual
     price = problem.stopping_cost(x) if callable(problem.stopping_cost) else problem.stopping_cost
@@ -88,6 +93,8 @@ ANSWERS = [
     ("growth", {"productivity": 0.8, "share": 0.6, "depreciation": 0.1, "discount": 0.07}, 1e-10),
     ("perpetual-put", {}, 1e-10),
     ("perpetual-put", {"strike": 40.0, "interest": 0.02, "volatility": 0.5}, 1e-10),
+    ("dividends", {}, 1e-10),
+    ("dividends", {"income": 0.5, "volatility": 1.2, "discount": 0.05}, 1e-10),
     ("leland", {}, 1e-10),
     ("leland", {"coupon": 3.0, "interest": 0.04, "volatility": 0.35, "payout": 0.0, "tax": 0.2}, 1e-10),
 ]

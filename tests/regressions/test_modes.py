@@ -478,3 +478,15 @@ def test_a_convergence_study_compares_every_mode():
     assert np.allclose(study.h, [1.0, 0.5, 0.25])
     assert study.solutions[0].value.shape == (2, 5)
     assert np.all(np.diff(study.errors) < 0)
+
+
+def test_no_change_leads_to_a_mode_that_never_arrives():
+    problem = hjb.Problem(
+        lambda x, u, mode: (u, 0 * u)[mode], lambda x, u, mode: 1.0, hjb.Box([-1.0], [1.0]),
+        target=lambda x, mode: (x[0], 1.0 + 0 * x[0])[mode],
+        modes=hjb.Modes(("goes", "stuck"), switching_cost=[[0, 0.1], [np.inf, 0]]),
+    )  # fmt: skip
+    grid = hjb.Grid([0.0], [1.0], (11,))
+    found = hjb.solve(problem, grid)
+    assert np.allclose(found.value[0], grid.axis(0), atol=1e-6)
+    assert np.all(np.isinf(found.value[1]))

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import cut_cells, stencil
-from hjbjax.discretisation.landing import Corners, corners
 from hjbjax.discretisation.interventions import Interventions
+from hjbjax.discretisation.landing import Corners, corners
 from hjbjax.discretisation.paths import Paths
 from hjbjax.discretisation.players import Players, find_players
 from hjbjax.discretisation.stencil import Links

@@ -84,8 +84,8 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
 def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorator of a public function of (problem, grid, ...): a problem with modes gets the mode as its first state.
 
-    The function also receives the grid with an axis of modes, and jumps and pushes as functions. Problems without modes,
-    jumps and pushes pass through unchanged.
+    The function also receives the grid with an axis of modes, and jumps and pushes as functions. Problems without
+    modes, jumps and pushes pass through unchanged.
 
     Args:
       *of_state: names of arguments that are functions of the state, which the user writes with the mode last.

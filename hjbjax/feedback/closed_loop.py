@@ -264,7 +264,8 @@ def _through_changes(
         now = u if stepping.held else loop.players(begun, at[:-1])[0]
         later, moved, code, more, seen = _advance(loop, stepping, solve, (begun, end, last), at, now)
         changed = code == CHANGE
-        moved = jnp.where(changed, after_changes(loop, later, moved, start), moved)
+        after = after_pushes(loop, later, after_changes(loop, later, moved, start), start)
+        moved = jnp.where(changed, after, moved)
         # a jump may lead into the target or out of the box
         ended, outside = loop.target(later, moved[:-1]) <= 0, loop.margin(moved[:-1]) <= 0
         code = jnp.where(changed & (later >= end), PathStatus.DURATION, code)

@@ -102,6 +102,7 @@ def after_pushes(loop: Loop, t: Number, y: jax.Array, start: Number) -> jax.Arra
     n = loop.push.grid.ndim
     found = jnp.asarray(loop.push(t, loop.wrap(y[:-1])[:n]), y.dtype)
     weight = loop.discount(jnp.asarray(t - start, y.dtype))
-    if y.size > n + 1:  # the discount is a function of the state, see ``discounting``
-        weight = weight * jnp.exp(-y[n])
+    known = n + 2 * (loop.clock > 0)  # the state, then clock and count of sudden changes
+    if y.size > known + 1:  # the discount is a function of the state, see ``discounting``
+        weight = weight * jnp.exp(-y[known])
     return y.at[:n].add(found[:n]).at[-1].add(weight * found[n])

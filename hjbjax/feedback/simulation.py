@@ -16,6 +16,7 @@ from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, is_grid
 from hjbjax.feedback.loop import Loop, check_shapes, noise_key, settled_loop, timeless
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
 from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon
+from hjbjax.feedback.pushing import push_table
 from hjbjax.feedback.sudden_changes import (
     grid_of_modes,
     switching_surplus,
@@ -24,7 +25,6 @@ from hjbjax.feedback.sudden_changes import (
     with_modes_apart,
     without_clock,
 )
-from hjbjax.feedback.pushing import push_table
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST

@@ -1,6 +1,5 @@
 """Pushes: the directions in which the controller may move the state at once, at a marginal cost."""
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -8,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.problem.pytree import REMEMBERED, as_partial, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, Number
 
 
@@ -85,31 +84,15 @@ def check_pushes(pushes: object) -> tuple[Push, ...]:
 
 def marginal_costs(pushes: Sequence[Push]) -> jax.tree_util.Partial:
     """The costs of all pushes per unit of length, (p,), as one function of the state; rewards are negative costs."""
-    paid = [push.cost if push.reward is None else push.reward for push in pushes]
-    signs = tuple(1 if push.reward is None else -1 for push in pushes)
-    functions = tuple(each.func if callable(each) else None for each in paid)
-    leaves = tuple((each.args, each.keywords) if callable(each) else each for each in paid)
-    return jax.tree_util.Partial(_together(functions, signs), leaves)
+    paid = tuple(push.cost if push.reward is None else push.reward for push in pushes)
+    signs = np.array([1.0 if push.reward is None else -1.0 for push in pushes])
+    return jax.tree_util.Partial(_together, paid, signs)
 
 
-@functools.lru_cache(maxsize=REMEMBERED)
-def _together(functions: tuple[Callable | None, ...], signs: tuple[int, ...]) -> Callable:
-    """The costs as a function of their leaves and of the state.
-
-    A closure, not an object, because the search for numbers that a function reads from outside follows closures. The
-    same closure for the same functions: otherwise every solve would repeat the checks on one state.
-    """
-
-    def push_costs(leaves: tuple, *arguments: Any) -> Array:
-        found = []
-        for function, leaf, sign in zip(functions, leaves, signs, strict=True):
-            if function is not None:
-                held, options = leaf
-                leaf = function(*held, *arguments, **options)
-            found.append(sign * jnp.asarray(leaf, float))
-        return jnp.stack(found)
-
-    return push_costs
+def _together(paid: tuple, signs: Array, *arguments: Any) -> Array:
+    """The costs, each a number or a function of the arguments, times their signs."""
+    found = [jnp.asarray(each(*arguments) if callable(each) else each, float) for each in paid]
+    return signs * jnp.stack(found)
 
 
 def _axis_direction(direction: Sequence[float]) -> tuple[int, ...]:

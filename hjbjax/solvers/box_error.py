@@ -149,6 +149,16 @@ def other_ends(problem: Problem, grid: Grid) -> tuple:
     return tuple(pair and tuple(others.get(kind, kind) for kind in pair) for pair in grid.edges)
 
 
+def _other_free_ends(level: Task) -> tuple:
+    """``other_ends``, without ends at which every value is fixed: a jump beyond them ends there."""
+    found, fixed = list(other_ends(level.problem, level.grid)), np.asarray(level.obstacles.fixed)
+    for axis, (pair, own) in enumerate(zip(found, level.grid.edges, strict=True)):
+        if pair:
+            ends = (bool(np.all(np.take(fixed, node, axis))) for node in (0, -1))
+            found[axis] = tuple(b if held else a for a, b, held in zip(pair, own, ends, strict=True))
+    return tuple(found)
+
+
 def _coarse_task(task: Task) -> Task | None:
     """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
     level = dataclasses.replace(task, on=task.on.chain, mesh=None)
@@ -164,7 +174,7 @@ def _coarse_task(task: Task) -> Task | None:
 
 def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     """|W − V| on the grid ``fine``, from V on a coarse one."""
-    grid = altered(level.grid, edges=other_ends(level.problem, level.grid))
+    grid = altered(level.grid, edges=_other_free_ends(level))
     others = level.on.on_grid(grid)
     restricted, policy = _defect(level, jnp.asarray(before, level.tol.dtype))
     start, defect = jax.device_get((restricted, policy.defect))

@@ -318,3 +318,35 @@ def test_a_discount_and_bounds_of_the_state_that_are_constant_change_nothing(cha
     problem = hjb.Problem(plain.drift, plain.cost, jumps=list(plain.jumps), **others)
     first, second = (hjb.solve(each, grid, scheme=CHAIN, tol=1e-9).value for each in (plain, problem))
     assert np.allclose(first, second, rtol=0, atol=1e-8)
+
+
+def test_dividends_of_an_insurer_are_those_of_the_best_barrier():
+    # claims of one size; dividends at once; every barrier is one linear system, and the best is found by trying all
+    premium, spread, rate, claim, beta = 0.8, 0.3, 0.4, 0.7, 0.1
+    problem = hjb.Problem(
+        lambda x, u: premium + 0 * x, noise=spread, discount=beta, target=lambda x: x[0] - 1e-9, exit_reward=0.0,
+        pushes=[hjb.Push([-1.0], reward=1.0)], jumps=[hjb.Jump(rate, lambda x, u: x - claim, cost=0.1)],
+    )  # fmt: skip
+    grid = hjb.Grid([0.0], [4.0], (201,))
+    found = hjb.solve(problem, grid, scheme=CHAIN, tol=1e-7)
+    x, h, n = grid.axis(0), grid.spacing(0), 201
+    below = np.minimum((np.maximum(x - claim, 0) / h + 1e-9).astype(int), n - 2)
+    share = (np.maximum(x - claim, 0) - x[below]) / h
+    best, chosen = -np.inf, 0
+    for barrier in range(20, 180):
+        matrix, right = np.eye(n), np.where(np.arange(n) > barrier, h, 0.0)
+        for i in range(1, n):
+            if i > barrier:
+                matrix[i, i - 1] = -1.0
+                continue
+            up, down = premium / h + spread**2 / (2 * h**2), spread**2 / (2 * h**2)
+            matrix[i, i - 1 : i + 2] = -down, beta + rate + up + down, -up
+            matrix[i, below[i]] -= rate * (1 - share[i])
+            matrix[i, below[i] + 1] -= rate * share[i]
+            right[i] = -rate * 0.1
+        value = np.linalg.solve(matrix, right)
+        if value[100] > best:
+            best, chosen, exact = value[100], barrier, value
+    assert np.max(np.abs(found.value - exact)) <= 1e-6
+    assert found.free_boundary()[0] == pytest.approx(x[chosen], abs=h)
+    assert found.box_error is None  # nothing is assumed beyond the target, nor where the reserve is paid out

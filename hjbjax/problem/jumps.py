@@ -42,7 +42,7 @@ class Jump:
       ...     lambda x, u: 0.05 * x - u, reward=lambda x, u: jnp.sqrt(u[0]), controls=hjb.Box([0.0], [1.0]),
       ...     discount=0.1, jumps=[crash],
       ... )
-      >>> hjb.solve(invested, hjb.Grid([0.0], [4.0], (81,))).status.name
+      >>> hjb.solve(invested, hjb.Grid([0.0], [4.0], (81,), edges="constrained")).status.name
       'CONVERGED'
     """
 

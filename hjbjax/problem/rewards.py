@@ -17,7 +17,7 @@ import numpy as np
 from hjbjax.problem.grid import Grid, with_prescriptions
 from hjbjax.problem.labels import REWARD
 from hjbjax.problem.problem import PAYMENTS, Problem
-from hjbjax.problem.pytree import altered
+from hjbjax.problem.pytree import REMEMBERED, altered
 
 
 def costs_of(problem: Problem) -> Problem:
@@ -46,10 +46,12 @@ def negative(payment: Any) -> Any:
     return _negative_number(payment)
 
 
+@functools.lru_cache(maxsize=REMEMBERED)
 def _negative_function(function: Callable) -> Callable:
     """Minus a function.
 
     It is a closure, not an object, because the search for numbers that a function reads from outside follows closures.
+    The same closure for the same function: otherwise every solve would repeat the checks on one state.
     """
 
     # messages show the signature of ``__wrapped__``; an object without a name is shown as ``reward``

@@ -61,6 +61,9 @@ def identity(thing: object, depth: int = 8) -> Hashable | None:
         return _identities((thing.func, *thing.args, *thing.keywords.values()), depth)
     if isinstance(thing, (tuple, list)):
         return _identities(thing, depth)
+    if isinstance(thing, dict):  # the keywords of a function that the package transforms
+        found = _identities(thing.values(), depth)
+        return None if found is None else (tuple(thing), found)
     if isinstance(thing, types.FunctionType):
         return _identity_of_function(thing, depth)
     if isinstance(thing, Composite):
@@ -78,8 +81,9 @@ def _identities(things: Iterable[object], depth: int) -> Hashable | None:
 
 
 def _identity_of_function(function: types.FunctionType, depth: int) -> Hashable | None:
-    """A function's code and the identities of its globals; None if one of these may change between two solves."""
-    if function.__closure__ or function.__kwdefaults__:  # cells can be rebound, and dictionaries are mutable
+    """A function's code and the identities of its globals and cells; None if one may change between two solves."""
+    cells = [_identity_of_cell(cell, function.__module__, depth) for cell in function.__closure__ or ()]
+    if None in cells or function.__kwdefaults__:  # dictionaries are mutable
         return None
     if not all(isinstance(each, (int, float, str, type(None))) for each in function.__defaults__ or ()):
         return None
@@ -91,7 +95,20 @@ def _identity_of_function(function: types.FunctionType, depth: int) -> Hashable 
         for each in outside
     ]
     # by repr, since 0.0 equals −0.0 and True equals 1; code objects compare their constants by type and bits
-    return None if None in found else (function.__code__, repr(function.__defaults__), tuple(found))
+    return None if None in found else (function.__code__, repr(function.__defaults__), tuple(found), tuple(cells))
+
+
+def _identity_of_cell(cell: types.CellType, module: str | None, depth: int) -> Hashable | None:
+    """The identity of the content of a cell, a function or a discrete choice; None if it may change, or is a number.
+
+    A user may rebind a cell. The package does not: its closures transform a user's function.
+    """
+    held = content(cell)
+    if (module or "").split(".")[0] != "hjbjax":
+        return None
+    if held is None or isinstance(held, (bool, int, str)):
+        return repr(held)
+    return identity(held, depth - 1) if isinstance(held, types.FunctionType) else None
 
 
 def names_read(code: types.CodeType) -> set[str]:

@@ -86,7 +86,7 @@ def test_a_cost_at_the_end_is_a_function_or_one_number(name, value):
 
 @pytest.mark.parametrize("options", [{"cost": cost}, {"discount": 0.1}, {"cost": cost, "discount": 0.1}])
 def test_a_running_maximum_stands_alone(options):
-    with pytest.raises(ValueError, match=r"Problem.running_max: .* leave out cost and discount"):
+    with pytest.raises(ValueError, match=r"Problem.running_max: .* leave out cost, pushes and discount"):
         Problem(drift, controls=U, running_max=lambda x: x[0], **options)
 
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.discretisation import posing
 from hjbjax.tracing import closures
-from hjbjax.tracing.outside import fingerprint
+from hjbjax.tracing.outside import fingerprint, identity, unnested
 from tests.support.compilation import compiling
 
 UNIT = hjb.Box([-1.0], [1.0])
@@ -438,6 +439,43 @@ def test_library_code_and_arguments_are_not_even_traced():
             assert found.__wrapped__ is asked
             assert found == getattr(closures.settled(problem, n), name).func
             assert not found._jaxprs
+
+
+def switching_and_jumping(rate, size):
+    return hjb.Problem(
+        lambda x, u, mode: u - (0.1, 0.4)[mode] * x, reward=lambda x, u, mode: (1.0, 0.5)[mode] - x[0] ** 2,
+        controls=hjb.Box([-1.0], [1.0]), discount=1.0,
+        modes=hjb.Modes(("a", "b"), rates=rate * np.array([[0, 1.2], [0.7, 0]])),
+        jumps=[hjb.Jump(lambda x, u, mode: 0.3, lambda x, u, mode: size * x)],
+        pushes=[hjb.Push([1.0], cost=lambda x, mode: 3.0)],
+    )  # fmt: skip
+
+
+def test_modes_jumps_pushes_and_rewards_share_programs():
+    grid = hjb.Grid([-1.0], [1.0], (13,))
+
+    def ask(rate, size):
+        return hjb.solve(switching_and_jumping(rate, size), grid, scheme=hjb.Upwind(), tol=1e-8).value
+
+    ask(1.0, 0.5)
+    programs, found = compiled(lambda: ask(0.5, -0.3))
+    assert programs == 0
+    assert np.max(np.abs(found - ask(1.0, 0.5))) > 1e-3
+
+
+def test_transformed_library_code_is_not_even_traced():
+    problem = hjb.Problem(
+        square, reward=still, controls=hjb.Box([-1.0], [1.0]), discount=lambda x: 1.0 + x[0] ** 2,
+        jumps=[hjb.Jump(0.3, still)],
+    )  # fmt: skip
+    for name in ("drift", "cost", "intensities", "landings"):
+        function = getattr(posing._for_solvers(problem, 1), name)
+        assert identity(unnested(function)) is not None, name
+    halved = hjb.Problem(square, reward=lambda x, u, half=0.5: half * x[0], controls=hjb.Box([-1.0], [1.0]))
+    number = 0.5
+    read = hjb.Problem(square, reward=lambda x, u: number * x[0], controls=hjb.Box([-1.0], [1.0]))
+    assert identity(unnested(posing._for_solvers(halved, 1).cost)) is not None
+    assert identity(unnested(posing._for_solvers(read, 1).cost)) is None  # the number may change
 
 
 def test_what_cannot_be_traced_is_left_to_the_checks():

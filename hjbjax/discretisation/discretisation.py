@@ -16,7 +16,7 @@ import numpy as np
 
 from hjbjax.discretisation import cut_cells, stencil
 from hjbjax.discretisation.interventions import Interventions
-from hjbjax.discretisation.landing import Corners, corners
+from hjbjax.discretisation.landing import Corners, landing_corners
 from hjbjax.discretisation.paths import Paths
 from hjbjax.discretisation.players import Players, find_players
 from hjbjax.discretisation.stencil import Links
@@ -295,7 +295,7 @@ class Discretisation:
         if self.problem.landings is None:
             return []
         found = components.components(self.problem.landings, *self._arguments(u, d, x), dtype=self.dtype)
-        return [corners(self.grid, list(y), self.dtype) for y in found]
+        return [landing_corners(self.grid, list(y), self.dtype) for y in found]
 
     def switching_costs(self) -> list:
         """The costs of changing the mode by 1, ..., k − 1, each (*grid); empty if the controller cannot change it."""

@@ -83,7 +83,7 @@ class Corners(NamedTuple):
         return total
 
 
-def corners(grid: Grid, y: Sequence[Any], dtype: Any) -> Corners:
+def landing_corners(grid: Grid, y: Sequence[Any], dtype: Any) -> Corners:
     """The corners for a jump to the state y, whose entries are arrays over the nodes, one per axis of the state."""
     strides = [math.prod(grid.shape[axis + 1 :]) for axis in range(grid.ndim)]
     nodes, weights = [jnp.zeros(grid.shape, jnp.int32)], [jnp.ones((), dtype)]

@@ -304,8 +304,8 @@ def leaks(on: Discretisation, policy: Greedy, held: jax.Array, lost: jax.Array) 
             axis = next(axis for axis, step in enumerate(offset) if step)
             leak = jnp.where(leads[axis], leak, 0) if axis in grid.state_axes else leak
         leaking = leaking + leak  # rates per unit time, (*grid): several small leaks add up
-    # relative to all rates of the node, since terms of the drift may cancel up to their rounding
     for landing in rates.landings:
         leaking = leaking + jnp.where(landing.ahead(lost), landing.rate, 0)
+    # relative to all rates of the node, since terms of the drift may cancel up to their rounding
     limit = LEAK * jnp.finfo(on.dtype).eps * rates.total()
     return grid.layout.some(~lost & ~held & (leaking > limit))

@@ -64,6 +64,17 @@ class Jump:
             raise ValueError(f"Jump.cost: got {cost!r}, wanted a finite number, or a function")
 
 
+def check_jumps(jumps: object) -> tuple[Jump, ...]:
+    """The jumps of a problem as a tuple.
+
+    Raises:
+      TypeError: something that is not a list of jumps.
+    """
+    if not isinstance(jumps, (list, tuple)) or not all(isinstance(jump, Jump) for jump in jumps):
+        raise TypeError(f"Problem.jumps: got {jumps!r}, wanted a list, as in [hjb.Jump(rate, landing)]")
+    return tuple(jumps)
+
+
 def _number_or_function(value: Any, name: str) -> Any:
     """A function as a pytree, or one number as an array."""
     if callable(value):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem import labels as labelling
-from hjbjax.problem.jumps import Jump
+from hjbjax.problem.jumps import Jump, check_jumps
 from hjbjax.problem.labels import COST, REWARD, Labels
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.pushes import Push, check_pushes
@@ -176,9 +176,7 @@ class Problem:
             raise TypeError(f"Problem.time_dependent: got {time_dependent!r}, wanted True or False")
         if modes is not None and not isinstance(modes, Modes):
             raise TypeError(f"Problem.modes: got {modes!r}, wanted hjb.Modes(('low', 'high'), rates=...)")
-        if not isinstance(jumps, (list, tuple)) or not all(isinstance(jump, Jump) for jump in jumps):
-            raise TypeError(f"Problem.jumps: got {jumps!r}, wanted a list, as in [hjb.Jump(rate, landing)]")
-        pushes = check_pushes(pushes)
+        jumps, pushes = check_jumps(jumps), check_pushes(pushes)
         # with a running maximum, V ≥ g, there is no integral to discount, so β V − L has no meaning
         if running_max is not None and (cost is not None or pushes or _is_nonzero(discount)):
             raise ValueError(
@@ -207,7 +205,7 @@ class Problem:
             "target": as_partial(target, "Problem.target"),
             "running_max": as_partial(running_max, "Problem.running_max"),
             "modes": modes,
-            "jumps": tuple(jumps),
+            "jumps": jumps,
             "pushes": pushes,
             "isaacs": isaacs,
             "time_dependent": bool(time_dependent),
@@ -217,14 +215,6 @@ class Problem:
             # static, because ``jit`` hides numbers and the certificate must be chosen while compiling
             "discounted": callable(discount) or (None if is_traced(discount) else bool(discount > 0)),
             "payoff": payoff,
-            "killing": None,
-            "mode_rates": None,
-            "switching_costs": None,
-            "intensities": None,
-            "landings": None,
-            "jump_costs": None,
-            "push_costs": None,
-            "push_steps": (),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)

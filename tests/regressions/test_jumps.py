@@ -23,8 +23,11 @@ def assert_certified(found, exact, seed):
     assert np.all(exact <= upper + slack), seed
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [(kind, 1) for kind in KINDS]
+    + [pytest.param(kind, 2, marks=[pytest.mark.slow] * (kind != "noise")) for kind in KINDS],
+)
 def test_random_problems_agree_with_a_dense_dynamic_program(kind, count):
     for seed in range(3):
         one = random_jumps.draw(seed, count=count)
@@ -95,7 +98,7 @@ def falling(rate, depth, **others):
     )
 
 
-@pytest.mark.parametrize("scheme", [CHAIN, None], ids=["chain", "default"])
+@pytest.mark.parametrize("scheme", [CHAIN, pytest.param(None, marks=pytest.mark.slow)], ids=["chain", "default"])
 def test_derivatives_are_those_of_differences(scheme):
     grid = hjb.Grid([0.0], [2.0], (41,))
 

@@ -353,3 +353,12 @@ def test_dividends_of_an_insurer_are_those_of_the_best_barrier():
     assert np.max(np.abs(found.value - exact)) <= 1e-6
     assert found.free_boundary()[0] == pytest.approx(x[chosen], abs=h)
     assert found.box_error is None  # nothing is assumed beyond the target, nor where the reserve is paid out
+
+
+def test_a_rate_that_is_zero_up_to_rounding_is_not_negative():
+    # 0.3 − 0.2 − 0.1 = −3e-17 under one action
+    problem = hjb.Problem(
+        lambda x, u: 0 * x, lambda x, u: x[0] + u[0] ** 2, hjb.Finite([[-0.1], [0.0]]), discount=1.0,
+        jumps=[hjb.Jump(lambda x, u: 0.3 - 0.2 + u[0], lambda x, u: 0 * x)],
+    )  # fmt: skip
+    assert hjb.solve(problem, hjb.Grid([0.0], [1.0], (5,)), scheme=CHAIN).status.name == "CONVERGED"

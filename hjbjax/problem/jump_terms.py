@@ -13,10 +13,10 @@ import jax.numpy as jnp
 
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
+from hjbjax.problem.rewards import negative
 from hjbjax.problem.types import Array
 
-NAMES = ("rate", "landing", "cost")  # of a jump
-OF_JUMPS = ("intensities", "landings", "jump_costs")  # of all jumps
+OF_JUMPS = ("intensities", "landings", "jump_costs")
 
 
 def with_jump_functions(problem: Problem) -> Problem:
@@ -32,12 +32,10 @@ def with_jump_functions(problem: Problem) -> Problem:
     """
     if not problem.jumps:
         return problem
-    rates, landings, costs = ([_function(getattr(jump, name)) for jump in problem.jumps] for name in NAMES)
-    paid = any(jump.cost is not None for jump in problem.jumps)
-    return altered(
-        problem, jumps=(), intensities=_stacked(rates), landings=_stacked(landings),
-        jump_costs=_stacked(costs) if paid else None,
-    )  # fmt: skip
+    rates, landings = ([_function(getattr(jump, name)) for jump in problem.jumps] for name in ("rate", "landing"))
+    costs = [jump.cost if jump.reward is None else negative(jump.reward) for jump in problem.jumps]
+    paid = None if all(cost is None for cost in costs) else _stacked([_function(cost) for cost in costs])
+    return altered(problem, jumps=(), intensities=_stacked(rates), landings=_stacked(landings), jump_costs=paid)
 
 
 def with_mean_jump_costs(problem: Problem) -> Problem:

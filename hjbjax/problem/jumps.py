@@ -29,9 +29,10 @@ class Jump:
       rate: λ ≥ 0, the expected number of jumps per unit time; a number or a function.
       landing: y, a function that returns the state after the jump, shape (n,).
       cost: c, in cost units; a number or a function. In a problem with rewards it is subtracted from them. Default: 0.
+      reward: the reward for each jump, instead of a cost, such as the profit from a sale.
 
     Raises:
-      ValueError: a rate that is negative, or numbers of the wrong shape.
+      ValueError: a rate that is negative, numbers of the wrong shape, or both ``cost`` and ``reward``.
       TypeError: a landing that is not a function.
 
     Example:
@@ -49,19 +50,31 @@ class Jump:
     rate: Any
     landing: Any
     cost: Any = None
+    reward: Any = None
 
-    def __init__(self, rate: Callable | Number, landing: Callable, cost: Callable | Number | None = None):
+    def __init__(
+        self,
+        rate: Callable | Number,
+        landing: Callable,
+        cost: Callable | Number | None = None,
+        *,
+        reward: Callable | Number | None = None,
+    ):
         if not callable(landing):
             raise TypeError(
                 f"Jump.landing: got {landing!r}, wanted a function (x, u) -> (n,), the state after the jump"
             )
         object.__setattr__(self, "rate", _number_or_function(rate, "Jump.rate"))
         object.__setattr__(self, "landing", as_partial(landing, "Jump.landing"))
-        object.__setattr__(self, "cost", None if cost is None else _number_or_function(cost, "Jump.cost"))
         if isinstance(self.rate, np.ndarray) and not 0 <= self.rate < np.inf:
             raise ValueError(f"Jump.rate: got {rate!r}, wanted a finite number ≥ 0, per unit time, or a function")
-        if isinstance(self.cost, np.ndarray) and not np.isfinite(self.cost):
-            raise ValueError(f"Jump.cost: got {cost!r}, wanted a finite number, or a function")
+        if cost is not None and reward is not None:
+            raise ValueError("Jump: got both cost and reward, wanted at most one of them, for each jump")
+        for name, given in {"cost": cost, "reward": reward}.items():
+            paid = None if given is None else _number_or_function(given, f"Jump.{name}")
+            if isinstance(paid, np.ndarray) and not np.isfinite(paid):
+                raise ValueError(f"Jump.{name}: got {given!r}, wanted a finite number, or a function")
+            object.__setattr__(self, name, paid)
 
 
 def check_jumps(jumps: object) -> tuple[Jump, ...]:

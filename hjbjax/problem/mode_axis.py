@@ -126,7 +126,7 @@ def _in_mode(function: jax.tree_util.Partial, mode: int) -> jax.tree_util.Partia
 
 def _jump_in_mode(jump: Jump, mode: int) -> Jump:
     """A jump whose functions have their last argument fixed."""
-    functions = {name: getattr(jump, name) for name in ("rate", "landing", "cost")}
+    functions = {name: getattr(jump, name) for name in ("rate", "landing", "cost", "reward")}
     return altered(jump, **{name: _in_mode(each, mode) for name, each in functions.items() if callable(each)})
 
 

@@ -73,10 +73,10 @@ class Problem:
       stopping_reward: the reward for stopping, at any time: V ≥ the reward, as for an American option.
       modes: the regimes between which the system changes at random or by choice, see ``Modes``. Values then have the
         shape (k, *grid).
-      jumps: sudden moves of the state at random times, a list of ``Jump``.
+      jumps: sudden moves of the state at random times, see ``Jump``.
       pushes: directions in which the controller may move the state at once, at a cost or a reward per unit of length,
-        see ``Push``. The costs and rewards keep their meaning in a problem of either kind. A problem that has only
-        rewards for pushes is a problem with rewards.
+        see ``Push``. The costs and rewards of jumps and pushes keep their meaning in a problem of either kind. A
+        problem that has only these rewards is a problem with rewards.
       isaacs: ``"upper"`` is min over u of max over d (the disturbance sees u), ``"lower"`` is max min. With rewards
         the disturbance also sees u if ``"upper"``: max over u of min over d.
       time_dependent: True if the functions take the time as their first argument.
@@ -190,7 +190,7 @@ class Problem:
             "reward": reward, "exit_reward": exit_reward, "terminal_reward": terminal_reward,
             "stopping_reward": stopping_reward,
         }  # fmt: skip
-        payoff = _payoff(costs | {"running_max": running_max}, rewards, pushes)
+        payoff = _payoff(costs | {"running_max": running_max}, rewards, (*jumps, *pushes))
         for name, paid in {"exit_cost": exit_cost, "exit_reward": exit_reward}.items():
             if paid is not None and target is None:
                 raise ValueError(f"Problem.{name}: there is no target to pay it on; give target as well")
@@ -272,10 +272,10 @@ def is_constrained(problem: Problem) -> bool:
     return problem.stopping_cost is not None or problem.running_max is not None
 
 
-def _payoff(costs: dict[str, Any], rewards: dict[str, Any], pushes: Sequence[Push]) -> str:
-    """The word for the payments of a problem, "cost" or "reward"; refuses both together, except in pushes."""
+def _payoff(costs: dict[str, Any], rewards: dict[str, Any], moves: Sequence[Jump | Push]) -> str:
+    """The word for the payments of a problem, "cost" or "reward"; refuses both together, except in jumps and pushes."""
     paid, earned = ([name for name, given in each.items() if given is not None] for each in (costs, rewards))
-    if not paid and not earned and any(push.reward is not None for push in pushes):
+    if not paid and not earned and any(move.reward is not None for move in moves):
         return REWARD
     if not earned:
         return COST

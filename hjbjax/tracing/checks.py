@@ -154,7 +154,7 @@ def jumps_of_one_state(problem: Problem, n: int) -> None:
     """
     lengths, letters = _lengths(problem, n), problem.arguments("x", "u", "d", "t")
     for number, jump in enumerate(problem.jumps):
-        for name, wanted in (("rate", ()), ("landing", (n,)), ("cost", ())):
+        for name, wanted in (("rate", ()), ("landing", (n,)), ("cost", ()), ("reward", ())):
             if callable(function := getattr(jump, name)):
                 said = f"Problem.jumps[{number}].{name}: {name}"
                 function_of(function, said, wanted, **{letter: lengths[letter] for letter in letters})

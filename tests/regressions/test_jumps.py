@@ -313,6 +313,22 @@ def test_files_and_costs_in_rewards(tmp_path):
     assert np.array_equal(hjb.load(tmp_path / "jumps.npz").value, spent.value)
 
 
+def test_rewards_of_jumps_are_minus_costs():
+    grid, sale = hjb.Grid([0.0], [2.0], (21,)), {"controls": hjb.Box([0.0], [1.0]), "discount": 0.5}
+    drift, land = lambda x, u: u - 0.1 * x, lambda x, u: 0.5 * x
+    costs = hjb.Problem(drift, lambda x, u: u[0] ** 2, jumps=[hjb.Jump(0.6, land, lambda x, u: -3 * x[0])], **sale)
+    rewards = hjb.Problem(
+        drift, reward=lambda x, u: -(u[0] ** 2), jumps=[hjb.Jump(0.6, land, reward=lambda x, u: 3 * x[0])], **sale
+    )
+    spent, earned = (hjb.solve(each, grid, scheme=CHAIN, tol=1e-9).value for each in (costs, rewards))
+    assert np.max(earned) > 1
+    assert np.allclose(earned, -spent, rtol=0, atol=1e-8)
+    only = hjb.Problem(drift, jumps=[hjb.Jump(0.6, land, reward=1.0)], **sale)
+    assert np.allclose(hjb.solve(only, grid, scheme=CHAIN, tol=1e-9).value, 0.6 / 0.5, rtol=0, atol=1e-8)
+    with pytest.raises(ValueError, match="both cost and reward"):
+        hjb.Jump(1.0, land, 1.0, reward=1.0)
+
+
 @pytest.mark.parametrize("change", ["discount", "controls"])
 def test_a_discount_and_bounds_of_the_state_that_are_constant_change_nothing(change):
     grid, plain = hjb.Grid([0.0], [2.0], (21,)), falling(0.4, 0.3)

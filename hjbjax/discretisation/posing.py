@@ -61,6 +61,7 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
     def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
         asked, grid = given[first], given[second]
         problems = [asked] if isinstance(asked, Problem) else asked if isinstance(asked, list) else []
+        _refuse_other_modes(problems, grid, name)
         if not any(map(_needs_posing, problems)):
             return function(**given)
         if isinstance(grid, Grid):
@@ -128,6 +129,21 @@ def _for_solvers(problem: Problem, n: int) -> Problem:
 def _is_joined(problem: object) -> bool:
     """True for a problem with modes, jumps or pushes, which ``over_checked_modes`` changes."""
     return _has_modes(problem) or (isinstance(problem, Problem) and bool(problem.jumps or problem.pushes))
+
+
+def _refuse_other_modes(problems: list[Problem], grid: object, name: str) -> None:
+    """Refuse a grid with modes for a problem of a user without modes: it would be solved with x = (mode, x)."""
+    if not (isinstance(grid, Grid) and grid.modes):
+        return
+    for problem in problems:
+        joined = isinstance(problem, Problem) and (
+            problem.mode_rates is not None or problem.switching_costs is not None
+        )
+        if isinstance(problem, Problem) and problem.modes is None and not joined:
+            raise ValueError(
+                f"{name}: got a grid with the modes {grid.modes!r}, but a problem without modes; wanted a grid of the "
+                "states only,\nsuch as the one that was passed with the modes, or solution.in_mode(...).grid"
+            )
 
 
 def _grid_of_all(grid: Grid, problems: list[Problem], name: str) -> Grid:

@@ -359,6 +359,15 @@ def test_paths_cost_what_the_value_promises_in_the_mean(kind):
     assert abs(mean - found.value_at(start, mode="low")) <= spread + 0.01 * np.ptp(found.value)
 
 
+def test_a_grid_with_modes_is_refused_by_a_problem_without_them(solved):
+    _, found = solved
+    plain = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+    for solve in (hjb.solve, lambda problem, grid: hjb.solve_batch([problem], grid)):
+        with pytest.raises(ValueError, match="but a problem without modes"):
+            solve(plain, found.grid)
+    assert hjb.solve(plain, found.in_mode("calm").grid).status.name == "CONVERGED"
+
+
 def test_mistakes_are_refused_with_the_mode():
     fine = {"modes": hjb.Modes(("a", "b"), rates=[[0, 1], [1, 0]]), "discount": 1.0}
     with pytest.raises(ValueError, match=r"in mode 'b': drift\(x, u\) returned shape \(2,\)"):

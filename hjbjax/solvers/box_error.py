@@ -150,7 +150,9 @@ def other_ends(problem: Problem, grid: Grid) -> tuple:
 
 
 def _other_free_ends(level: Task) -> tuple:
-    """``other_ends``, without ends at which every value is fixed: a jump beyond them ends there."""
+    """``other_ends``; with jumps, without ends at which every value is fixed, because a jump beyond them ends there."""
+    if level.problem.landings is None:
+        return other_ends(level.problem, level.grid)
     found, fixed = list(other_ends(level.problem, level.grid)), np.asarray(level.obstacles.fixed)
     for axis, (pair, own) in enumerate(zip(found, level.grid.edges, strict=True)):
         if pair:

@@ -517,7 +517,9 @@ def test_random_disturbances_of_a_finite_set_are_refused():
         disturbances=Finite([[0.0], [1.0]]),
     )
     solution = solution_with(np.ones((5, 1)), hjb.Grid([-1.0], [1.0], (5,)))
-    with pytest.raises(ValueError, match=r"the disturbances are 2 points, .* wanted a Box or a Ball, or random=0"):
+    with pytest.raises(
+        ValueError, match=r"the disturbances are 2 points, .* wanted a Box, a Ball or a Simplex, or random=0"
+    ):
         hjb.dissipation(problem, solution, [0.5], 2.0)
     assert hjb.dissipation(problem, solution, [0.5], 2.0, random=0).supplied == pytest.approx(1.0)
 

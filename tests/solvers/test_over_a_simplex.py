@@ -205,12 +205,12 @@ def test_derivatives_of_searched_actions(n):
         return solution.value[3:18:7], solution.policy[3:18:7]
 
     with jax.enable_x64(True):
-        point, h = (1.0, 0.15), 1e-2  # a search leaves noise of 1e-7 in V, which a shorter step magnifies
+        point, h = (1.0, 0.15), 1e-3  # V has a kink in its slope here: differences are off by 0.06 h
         moves = jax.jacfwd(answer, (0, 1))(*point)
         for place in range(2):
             ahead, behind = (answer(*(p + s * h * (i == place) for i, p in enumerate(point))) for s in (1, -1))
             for (name, atol), move, plus, minus in zip(
-                (("value", 1e-5), ("policy", 1e-3)), [each[place] for each in moves], ahead, behind, strict=True
+                (("value", 1e-4), ("policy", 1e-3)), [each[place] for each in moves], ahead, behind, strict=True
             ):
                 np.testing.assert_allclose(move, (plus - minus) / (2 * h), atol=atol, err_msg=name)
 

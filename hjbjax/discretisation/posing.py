@@ -1,9 +1,8 @@
-"""Decorators of public functions, for problems with modes, pushes, and bounds or a discount that depend on the state.
+"""Decorators of public functions, for problems with modes, jumps, pushes, or bounds or discounts of the state.
 
-The solvers support fixed sets of controls and constant discounts, modes as the first entry of the state, and pushes as
-one function of the state. A
-decorated function receives such a problem, and its grid, instead of the user's. In the solutions that it returns, the
-controls and the problem are the user's again. The grid keeps its axis of modes.
+The solvers support fixed sets of controls and constant discounts, modes as the first entry of the state, and all jumps
+and all pushes as functions. A decorated function receives such a problem, and its grid, instead of the user's. In the
+solutions that it returns, the controls and the problem are the user's again. The grid keeps its axis of modes.
 """
 
 import inspect
@@ -39,8 +38,8 @@ T = TypeVar("T")
 def without_horizon(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function of (problem or problems, grid, ...) without a horizon.
 
-    Problems without modes and pushes, with a constant discount, and with a fixed set of controls or no control, pass
-    through unchanged.
+    Problems without modes, jumps and pushes, with a constant discount, and with a fixed set of controls or no control,
+    pass through unchanged.
     """
     return _posing(function, _in_own_time)
 
@@ -135,11 +134,8 @@ def _refuse_other_modes(problems: list[Problem], grid: object, name: str) -> Non
     """Refuse a grid with modes for a problem of a user without modes: it would be solved with x = (mode, x)."""
     if not (isinstance(grid, Grid) and grid.modes):
         return
-    for problem in problems:
-        joined = isinstance(problem, Problem) and (
-            problem.mode_rates is not None or problem.switching_costs is not None
-        )
-        if isinstance(problem, Problem) and problem.modes is None and not joined:
+    for problem in (each for each in problems if isinstance(each, Problem)):
+        if problem.modes is None and problem.mode_rates is None and problem.switching_costs is None:
             raise ValueError(
                 f"{name}: got a grid with the modes {grid.modes!r}, but a problem without modes; wanted a grid of the "
                 "states only,\nsuch as the one that was passed with the modes, or solution.in_mode(...).grid"

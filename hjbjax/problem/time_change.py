@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from hjbjax.problem.jump_terms import constant
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, State
@@ -36,7 +37,7 @@ def in_own_time(problem: Problem) -> Problem:
         return problem
     noise = problem.noise
     if noise is not None and not callable(noise):
-        noise = jax.tree_util.Partial(_constant, noise)
+        noise = jax.tree_util.Partial(constant, noise)
     scaled = {
         "drift": _over(problem.drift, problem.discount, 1),
         "cost": None if problem.cost is None else _over(problem.cost, problem.discount, 1),
@@ -56,11 +57,6 @@ def with_killing(problem: Problem) -> Problem:
     if not callable(problem.discount):
         return problem
     return altered(problem, discount=0.0, discounted=False, killing=problem.discount)
-
-
-def _constant(value: Array, *arguments: Array) -> Array:
-    """A constant as a function."""
-    return value
 
 
 def _over(function: jax.tree_util.Partial, discount: jax.tree_util.Partial, root: int) -> jax.tree_util.Partial:

@@ -18,8 +18,8 @@ class Jump:
         H = min_u [ L + f·DV + ½ tr(σσᵀ D²V) + Σ λ(x, u) (V(y(x, u)) − V(x) + c(x, u)) ].
 
     All functions take ``(x, u)``; also the disturbance in a game, the time first if the problem depends on it, and the
-    mode last in a problem with modes. A jump keeps the mode. The minimum over u is exact if λ is affine and λ c quadratic
-    in u, and y does not depend on u; otherwise it is searched.
+    mode last in a problem with modes. A jump keeps the mode. The minimum over u is exact if λ is affine and λ c
+    quadratic in u, and y does not depend on u; otherwise it is searched.
 
     Between the nodes V(y) is interpolated linearly, with non-negative weights, so the scheme remains a Markov chain. A
     jump that would leave the box ends on its boundary; at open, linear and Neumann ends V continues with its slope. A

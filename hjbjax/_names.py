@@ -30,6 +30,7 @@ from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pushes import Push
 from hjbjax.problem.sets import Ball, Box, Finite, Simplex
+from hjbjax.problem.spaces import discount_rate, from_gymnasium
 from hjbjax.problem.stretching import Sinh
 from hjbjax.semi_lagrangian.scheme import SemiLagrangian
 from hjbjax.solution.checkpoints import Checkpoint
@@ -88,11 +89,13 @@ __all__ = [
     "avoid",
     "chain",
     "convergence_study",
+    "discount_rate",
     "dissipation",
     "equilibrium",
     "estimate",
     "expected_exit_time",
     "filtering",
+    "from_gymnasium",
     "from_hj_reachability",
     "geometry",
     "greedy_feedback",

@@ -9,7 +9,9 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.mode_axis import with_modes
 from hjbjax.problem.stretching import Sinh
+from hjbjax.solution import numpy_feedback
 from hjbjax.solution.files import Expected, FileError
+from hjbjax.solution.modes import switching_modes
 from hjbjax.solution.status import Status
 
 if TYPE_CHECKING:  # an optional dependency, imported on use
@@ -64,6 +66,31 @@ def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         if complaint := wanted.complaint(array.shape, array.dtype.str):
             raise ValueError(f"Solution.save: {name} {complaint}; save the solutions of a batch one at a time")
     return header, arrays
+
+
+def feedback_contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of the file of ``Solution.export``, whose format ``numpy_feedback`` describes."""
+    grid, labels = solution.grid, solution.labels
+    header = {
+        "format": numpy_feedback.FORMAT, "version": numpy_feedback.VERSION, "names": grid.names, "units": grid.units,
+        "modes": grid.modes, "controls": labels.controls, "control_units": labels.control_units,
+    }  # fmt: skip
+    known = solution.problem is not None and bool(grid.modes)
+    arrays = {
+        "lo": grid.lo,
+        "hi": grid.hi,
+        "periodic": np.array(grid.periodic),
+        "uniform": np.array([stretch is None for stretch in grid.stretch]),
+        **{f"nodes{axis}": grid.axis(axis) for axis in range(grid.ndim)},
+        "value": solution.value,
+        "control": solution.policy,
+        "disturbance": solution.disturbance,
+        "enumerated": np.array([solution.discrete, solution.discrete_disturbance]),
+        "switching": switching_modes(solution) if known else None,
+        "times": solution.times,
+    }
+    found = {name: np.asarray(array) for name, array in arrays.items() if array is not None}
+    return {**header, "arrays": sorted(found)}, found
 
 
 def plan(header: dict) -> dict[str, Expected]:

@@ -24,6 +24,7 @@ NAMES = {
     "devices": ("speed", "one problem on two devices of a processor against one device, and outer steps on eight"),
     "gradients": ("speed", "value and gradient of a solve against the value, and against central differences"),
     "startup": ("speed", "the first answer of a process: importing, compiling, pictures; cold and with the cache"),
+    "agents": ("accuracy", "returns of feedbacks in four environments of Gymnasium, next to published agents"),
     "precision": ("accuracy", "error against seconds: the gain of second order"),
     "march": ("speed", "marches against hj_reachability with equal schemes: seconds and bytes"),
     "memory": ("accuracy", "the memory estimate against the peak of separate processes"),

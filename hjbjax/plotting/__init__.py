@@ -1,8 +1,8 @@
 """Plots of values, feedbacks and closed loops.
 
-Every function draws on the ``ax`` argument, by default pyplot's current axes, and returns a ``Picture``: the list of
-its artists, the main one first, with ``.figure`` and ``.save(path)``. The functions do not show figures and do not
-change rcParams. If axes are given, pyplot is not imported.
+Every function draws on the ``ax`` argument, by default on a new figure, and returns a ``Picture``: the list of its
+artists, the main one first, with ``.ax``, ``.figure`` and ``.save(path)``. To draw on a picture pass its ``.ax``.
+The functions do not show figures and do not change rcParams. If axes are given, pyplot is not imported.
 
 A plot has one or two axes. Fields over more states are cut by ``fixed={axis or name: coordinate}``, with linear
 interpolation between nodes as in ``value_at``. Entries that are not finite are hatched and explained in the legend. A

@@ -40,7 +40,7 @@ def estimates(
       components: indices of the states to plot; ``None`` for all.
       measurements: plot the mean rates of the measurement record, dy/dt over each interval, as dots.
       grid: a grid with the names of the states; along its periodic axes the estimates are shifted next to the state.
-      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on; ``None`` makes a new figure.
       names: names of the states, instead of the grid's.
 
     Returns:
@@ -113,7 +113,7 @@ def density(
       axes: indices of one or two axes; ``None`` for the first two, or the only one.
       state: the true state, shape (n,), drawn as a circle over two axes and as a line over one.
       estimate: the estimated state, shape (n,), drawn as a cross over two axes and as a dashed line over one.
-      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on; ``None`` makes a new figure.
       colorbar: draw a colour bar next to a two-dimensional plot.
 
     Returns:

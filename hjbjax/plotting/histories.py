@@ -36,7 +36,7 @@ def costates(
 
     Keyword Args:
       solution: a grid solution of the same problem, or ``None``; its DV is a broad dashed line, drawn inside the grid.
-      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on; ``None`` makes a new figure.
       names: names of the states, instead of the grid's.
 
     Returns:
@@ -85,7 +85,7 @@ def controls(
       path: the path of ``simulate``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on; ``None`` makes a new figure.
       names: names of the inputs.
       solution: gives the names, and the ranges of the controls, so that tiny variations are drawn as constant.
 

@@ -80,7 +80,7 @@ def zero_level_set(
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on, three-dimensional for three free axes; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on, three-dimensional for three free axes; ``None`` makes a new figure.
       fixed: coordinates at which axes are cut, by number or name.
       project: axes, by number or name, along which the set is projected.
       inside: ``"below"`` for {V ≤ 0}, as in ``reach``, ``"above"`` for {V ≥ 0}, as in ``avoid``; ``None`` follows the
@@ -315,7 +315,7 @@ def animation(
         solution, ``ax=`` and ``time=``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on, cleared for every frame; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on, cleared for every frame; ``None`` makes a new figure.
       interval: milliseconds per frame.
       options: passed to ``draw``.
 

@@ -62,7 +62,7 @@ def value(
       solution: the solution of ``solve`` or ``march``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on; ``None`` makes a new figure.
       fixed: coordinates at which axes are cut, by number or name; at most two axes may remain free. For a problem with
         modes also ``"mode"``; over one state all modes are drawn if it is not given.
       time: for a solution of ``march``, the time to draw. The nearest stored time is used; ``None`` is the earliest.
@@ -224,7 +224,7 @@ def trajectory(
       path: the path of ``simulate``: ``times`` (k+1,) and ``states`` (k+1, n).
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on; ``None`` makes a new figure.
       axes: the two states of the plane; ``None``, or a path with one state, plots all states over time.
       grid: a grid with the names, whose periodic axes are wrapped; the line is broken at the seam.
       names: names of the states, instead of the grid's.

@@ -85,7 +85,7 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
       study: the result of ``perturbation_study``.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on; ``None`` makes a new figure.
 
     Returns:
       The artists, first the line of the values against ε.
@@ -125,7 +125,7 @@ def residuals(solution: Solution, *, ax: Axes | None = None, label: str | None =
       solution: the solution of ``solve``. Its history is stored on the host, and ``jit`` and ``vmap`` drop it.
 
     Keyword Args:
-      ax: matplotlib axes to draw on; ``None`` uses pyplot's current axes.
+      ax: matplotlib axes to draw on; ``None`` makes a new figure.
       label: label of the line in the legend, to compare several solutions.
 
     Raises:

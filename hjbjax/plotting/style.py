@@ -127,37 +127,32 @@ def save_figure(figure: Figure, path: Path, *, format: str | None = None, **opti
 
 
 def axes_of(ax: Axes | None, *, wide: bool = False) -> Axes:
-    """The given axes, or pyplot's current axes, or the axes of a new pyplot figure."""
-    if ax is not None:
-        return ax
-    from matplotlib import pyplot
+    """The given axes, or the axes of a new pyplot figure; pyplot's current figure is used if it is empty.
 
-    if not pyplot.get_fignums():
-        pyplot.figure(figsize=WIDE if wide else NARROW, layout="constrained")
-    return styled(pyplot.gca())
+    Raises:
+      ValueError: the given axes are three-dimensional.
+    """
+    if ax is None:
+        return styled(new_figure(WIDE if wide else NARROW).add_subplot())
+    if ax.name == "3d":
+        raise ValueError("got three-dimensional axes for a flat picture; leave out ax, which makes a new figure")
+    return ax
 
 
 def solid_axes(ax: Axes | None) -> Any:
-    """The given three-dimensional axes, or pyplot's current ones, or those of a new figure if these are flat.
+    """The given three-dimensional axes, or those of a new figure.
 
     Raises:
       ValueError: the given axes are flat.
     """
-    if ax is not None:
-        if ax.name != "3d":
-            raise ValueError(
-                "zero_level_set: got flat axes for three free states; pass axes of projection='3d', or cut one state "
-                "with fixed={...}"
-            )
-        return ax
-    from matplotlib import pyplot
-
-    figure = pyplot.gcf() if pyplot.get_fignums() else pyplot.figure(figsize=SOLID, layout="constrained")
-    if figure.axes and figure.gca().name == "3d":
-        return figure.gca()
-    if figure.axes:  # it already has flat axes
-        figure = pyplot.figure(figsize=SOLID, layout="constrained")
-    return figure.add_subplot(projection="3d")
+    if ax is None:
+        return new_figure(SOLID).add_subplot(projection="3d")
+    if ax.name != "3d":
+        raise ValueError(
+            "zero_level_set: got flat axes for three free states; pass axes of projection='3d', or cut one state with "
+            "fixed={...}"
+        )
+    return ax
 
 
 def new_figure(size: tuple[float, float]) -> Figure:

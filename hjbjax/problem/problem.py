@@ -22,6 +22,7 @@ from hjbjax.problem.modes import Modes
 from hjbjax.problem.pushes import Push, check_pushes
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.sets import AdmissibleSet, AnyControl, Ball, Box, Finite, Simplex
+from hjbjax.problem.spaces import is_environment, is_space
 from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
 
 PAYMENTS = {  # the payments of a problem with rewards, and the same payments as costs
@@ -163,8 +164,7 @@ class Problem:
         terminal_reward: Callable | Number | None = None,
         stopping_reward: Callable | Number | None = None,
     ):
-        if not callable(drift):
-            raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
+        _check_functions(drift, target)
         _check_sets(controls, disturbances)
         count = 0 if controls is None else getattr(controls, "dim", None)  # unknown for a function of the state
         words = labelling.checked(control_names, control_units, inside, count)
@@ -299,18 +299,47 @@ def _is_nonzero(discount: Callable | Number) -> bool:
     return callable(discount) or is_traced(discount) or bool(discount != 0)
 
 
+def _check_functions(drift: object, target: object) -> None:
+    """Refuse a drift or a target that is not a function, with the function that was probably meant."""
+    if is_environment(drift):
+        raise TypeError(
+            "Problem.drift: got an environment, wanted a function (x, u) -> (n,): write the step of the environment as "
+            "a rate of change,\nand controls=hjb.from_gymnasium(env.action_space)"
+        )
+    if not callable(drift):
+        raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
+    if isinstance(target, (tuple, list, np.ndarray)):
+        cure = "the union of several targets is lambda x: jnp.minimum(first(x), second(x))"
+        if not any(map(callable, target)):
+            cure = "a ball around a point is lambda x: jnp.linalg.norm(x - point) - radius"
+        raise TypeError(f"Problem.target: got {target!r:.100}, wanted a function of the state, ≤ 0 inside;\n{cure}")
+
+
 def _check_sets(controls: object, disturbances: object) -> None:
     """Refuse sets of an unknown kind; a common mistake is to pass bounds without a ``Box``."""
     for name, admissible in (("controls", controls), ("disturbances", disturbances)):
         if name == "controls" and callable(admissible):  # bounds that depend on the state
             continue
         if admissible is not None and not isinstance(admissible, (Box, Ball, Simplex, Finite, AnyControl)):
-            cure = ""
-            if isinstance(admissible, (tuple, list)) and len(admissible) == 2:
-                cure = f": hjb.Box({admissible[0]!r}, {admissible[1]!r})"
             raise TypeError(
-                f"Problem.{name}: got {admissible!r}, wanted a Box, a Ball, a Simplex, a Finite or None{cure}"
+                f"Problem.{name}: got {admissible!r:.200}, wanted a Box, a Ball, a Simplex, a Finite or None"
+                f"{_set_for(admissible)}"
             )
+
+
+def _set_for(given: object) -> str:
+    """The set that was probably meant, for a message."""
+    if is_space(given):
+        return " of hjbjax: hjb.from_gymnasium(space)"
+    try:
+        count, numeric = np.ndim(given), np.asarray(given).dtype.kind in "iuf"  # type: ignore[arg-type]
+    except ValueError:
+        return ""
+    if isinstance(given, (tuple, list)) and len(given) == 2:
+        return f": hjb.Box({given[0]!r}, {given[1]!r})"
+    if numeric and count == 1:
+        return ": the values of one input are hjb.Finite(values[:, None]), all values between them hjb.Box(lo, hi)"
+    return ": hjb.Finite(points)" if numeric and count == 2 else ""
 
 
 def _rate(discount: object) -> Any:

@@ -21,33 +21,10 @@ import numpy as np
 
 from hjbjax.problem.settings import own_settings, refuse_error_checks
 from hjbjax.problem.types import DType, Numbers
+from hjbjax.problem.words import ELSEWHERE, WAYS
 
 P = ParamSpec("P")
 T = TypeVar("T")
-ELSEWHERE = {  # names of arguments in other packages and books, and the names used here
-    **dict.fromkeys(("dynamics", "f", "ode", "fun"), ("drift",)),
-    **dict.fromkeys(("loss", "l", "lagrangian"), ("cost",)),
-    **dict.fromkeys(("utility", "profit", "payoff", "flow_payoff", "income", "return_function"), ("reward",)),
-    **dict.fromkeys(("bequest", "scrap_value", "terminal_value", "terminal_utility"), ("terminal_reward",)),
-    **dict.fromkeys(("exercise", "stopping_payoff", "stopping_value"), ("stopping_reward",)),
-    **dict.fromkeys(("gamma", "beta", "rho", "rate", "mortality", "hazard", "short_rate"), ("discount",)),
-    **dict.fromkeys(("u", "action", "actions", "input", "inputs"), ("controls",)),
-    **dict.fromkeys(("d", "adversary", "opponent"), ("disturbances",)),
-    **dict.fromkeys(("sigma", "diffusion", "epsilon"), ("noise",)),
-    **dict.fromkeys(("tolerance", "eps", "atol", "threshold"), ("tol",)),
-    **dict.fromkeys(("initial", "init", "v0", "initial_values"), ("guess",)),
-    **dict.fromkeys(("t", "tf", "t_final", "t_span", "time"), ("horizon", "duration")),
-    **dict.fromkeys(("min", "lower", "left"), ("lo",)),
-    **dict.fromkeys(("max", "upper", "right"), ("hi",)),
-    **dict.fromkeys(("n", "num", "size", "points", "nodes", "resolution"), ("shape", "points")),
-    **dict.fromkeys(("dt", "time_step"), ("step", "max_step")),
-    **dict.fromkeys(("save_at", "saveat", "ts", "t_eval"), ("times",)),
-    **dict.fromkeys(("noise", "r"), ("measurement_noise", "radius")),
-    **dict.fromkeys(("goal",), ("target",)),
-    **dict.fromkeys(("slice", "cut", "at"), ("fixed",)),
-    **dict.fromkeys(("accuracy", "order", "discretization"), ("scheme",)),
-    **dict.fromkeys(("solver", "algorithm"), ("method",)),
-}
 # the start of an error message of a function that other public functions call
 INNER = re.compile(r"^(lane \d+: )?(?:solve|solve_batch|march|reach_probability): ")
 INTERRUPT = re.compile(r"\nKeyboardInterrupt\b.*\s*\Z")  # end of a traceback in the text of an XLA error
@@ -167,6 +144,9 @@ def refuse_misspelt(words: Iterable[str], by_name: Set[str], function: str) -> N
         elsewhere = [own for own in ELSEWHERE.get(word.lower(), ()) if own in by_name]
         near = parts or elsewhere or difflib.get_close_matches(word, by_name)
         cure = f"did you mean {near[0]}?" if near else f"wanted one of {', '.join(sorted(by_name - {'self'}))}"
+        own, way = WAYS.get(word.lower(), (None, ""))  # the keyword that belongs to the word, if only functions with it
+        if way and (own in by_name or (own is None and not elsewhere)):
+            cure = way
         raise TypeError(f"{function}() got an unexpected keyword argument {word!r}: {cure}")
 
 

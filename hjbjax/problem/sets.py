@@ -201,7 +201,10 @@ class Finite:
     def __post_init__(self) -> None:
         points = _finite_numbers(self.points, "Finite.points")
         if np.ndim(points) == 1 and np.size(points) > 0:  # ambiguous: three controls, or one control of three inputs
-            raise ValueError(f"Finite: got points of shape {np.shape(points)}, wanted (K, m): one row per control")
+            raise ValueError(
+                f"Finite: got points of shape {np.shape(points)}, wanted (K, m): one row per control,\n"
+                "as in hjb.Finite([[-1.0], [0.0], [1.0]]) for one input"
+            )
         if np.ndim(points) != 2 or 0 in np.shape(points):
             raise ValueError(f"Finite: no admissible control: got points of shape {np.shape(points)}, wanted (K, m)")
         object.__setattr__(self, "points", points)

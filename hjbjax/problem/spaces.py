@@ -22,6 +22,11 @@ def is_space(thing: object) -> bool:
     return hasattr(thing, "contains") and hasattr(thing, "sample") and hasattr(thing, "seed")
 
 
+def is_environment(thing: object) -> bool:
+    """True for an environment of Gymnasium."""
+    return hasattr(thing, "action_space") and hasattr(thing, "observation_space")
+
+
 @front_door
 def from_gymnasium(
     space: Any,
@@ -57,7 +62,7 @@ def from_gymnasium(
       >>> from_gymnasium(space, (91, 71), names=("position", "velocity")).hi.tolist()
       [0.6, 0.07]
     """
-    if hasattr(space, "action_space"):
+    if is_environment(space):
         raise TypeError("from_gymnasium: got an environment, wanted env.action_space or env.observation_space")
     if shape is None and options:
         raise TypeError(f"from_gymnasium: {', '.join(options)} belong to a grid; give shape= as well")

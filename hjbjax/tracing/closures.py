@@ -30,6 +30,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
+from hjbjax.problem.spaces import is_space
 from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import host_functions, jaxprs
@@ -149,7 +150,10 @@ def with_settled_functions(function: Callable) -> Callable:
         if (first, second) == ("problem", "grid") and {first, second} <= given.keys():
             kinds = [type(given[name]).__name__ for name in (first, second)]
             if not isinstance(given[first], Problem) or not isinstance(given[second], Grid):
-                raise TypeError(f"{function.__name__}: got {', '.join(kinds)}; wanted a Problem and a Grid")
+                raise TypeError(
+                    f"{function.__name__}: got {', '.join(kinds)}; wanted a Problem and a Grid"
+                    + (" of hjbjax: hjb.from_gymnasium(space, shape)" if is_space(given[second]) else "")
+                )
         if isinstance(given.get(second), Grid) and first in given:
             given[first] = _settle_all(given[first], given[second].ndim, given.get("dtype"))
         if is_traced(given):

@@ -539,13 +539,20 @@ def test_costates_and_the_slopes_of_the_value_lie_on_each_other():
     assert len(alone) == 3
 
 
-def test_without_axes_a_picture_goes_on_those_of_pyplot():
+def test_without_axes_every_picture_has_a_new_figure():
     pyplot.close("all")
+    empty = pyplot.figure(figsize=(3.0, 3.0))
     first = on_current_axes.value(plane(), colorbar=False)
-    assert first.figure is pyplot.gcf()
-    assert first.ax is pyplot.gca()
-    second = on_current_axes.trajectory(path_of([[0.5, 1.0], [0.0, 0.0]]))
-    assert second.ax is first.ax
+    assert first.figure is empty  # which the user made for it
+    second = on_current_axes.value(plane(), fixed={"velocity": 0.0})
+    assert second.figure is not first.figure
+    cube = on_current_axes.zero_level_set(made(volume().grid, lambda x: np.sum(x, axis=-1) - 2.0))
+    assert cube.ax.name == "3d"
+    path = path_of([[0.5, 1.0], [0.0, 0.0]])
+    assert on_current_axes.controls(path).ax.name == "rectilinear"
+    assert on_current_axes.trajectory(path, ax=second.ax).figure is second.figure
+    with pytest.raises(ValueError, match="got three-dimensional axes for a flat picture; leave out ax"):
+        on_current_axes.controls(path, ax=cube.ax)
     pyplot.close("all")
 
 

@@ -40,7 +40,13 @@ def test_discrete_actions_keep_their_numbers():
 @pytest.mark.parametrize(
     ("space", "shape", "options", "kind", "match"),
     [
-        (SimpleNamespace(action_space=1), None, {}, TypeError, r"got an environment, wanted env\.action_space"),
+        (
+            SimpleNamespace(action_space=1, observation_space=2),
+            None,
+            {},
+            TypeError,
+            r"got an environment, wanted env\.action_space",
+        ),
         (SimpleNamespace(n=3), None, {}, TypeError, "wanted a Box, a Discrete or a MultiDiscrete"),
         (discrete(3), (5,), {}, ValueError, "wanted a Box for a grid; a discrete state is a mode"),
         (box([-np.inf], [1]), (5,), {}, ValueError, r"no bounds on the axes \[0\][\s\S]*lo=\[-3\.0\], hi=\[3\.0\]"),

@@ -65,7 +65,7 @@ def _posing(function: Callable[P, T], discounting: Callable[[Problem, Grid, str]
             return function(**given)
         if isinstance(grid, Grid):
             n = without_modes(grid).ndim
-            joined = [_for_solvers(each, n) if _is_joined(each) else each for each in problems]
+            joined = [for_solvers(each, n) if _is_joined(each) else each for each in problems]
             given[second] = grid = _grid_of_all(grid, problems, name)
             made = [posed(each, grid) if _needs_posing(each) else each for each in joined]
             given[first] = made[0] if isinstance(asked, Problem) else made
@@ -97,7 +97,7 @@ def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]
         def call(function: Callable[..., Any], given: dict[str, Any]) -> Any:
             problem, grid = given[first], given[second]
             if _is_joined(problem) and isinstance(grid, Grid):
-                given[first] = _for_solvers(problem, without_modes(grid).ndim)
+                given[first] = for_solvers(problem, without_modes(grid).ndim)
             if _has_modes(problem) and isinstance(grid, Grid):
                 given[second] = with_modes(grid, problem.modes.names)
                 given |= {name: of_mode(given[name], problem.modes) for name in of_state if name in given}
@@ -120,7 +120,7 @@ def _has_modes(problem: object) -> bool:
     return isinstance(problem, Problem) and problem.modes is not None
 
 
-def _for_solvers(problem: Problem, n: int) -> Problem:
+def for_solvers(problem: Problem, n: int) -> Problem:
     """The problem with costs, the mode as its first state, and the mean costs of its jumps in the running cost."""
     return with_mean_jump_costs(over_checked_modes(costs_of(problem), n))
 

@@ -2,6 +2,6 @@
 
 - ``simulation``: ``simulate``; ``closed_loop`` integrates the loop, ``loop`` evaluates it at one state.
 - ``feedback``: the control between the nodes; ``path``: the result; ``payments``: its cost compared with V;
-  ``discounting``: discounts that depend on the state along a path.
+  ``discounting``: discounts that depend on the state; ``sudden_changes``: random changes; ``pushing``: interventions.
 - ``safety_filter``: a control that keeps the state in a tube; ``dissipation``: energies along paths.
 """

@@ -34,8 +34,8 @@ import numpy as np
 from hjbjax.feedback.loop import Actions, BridgeDraw, Loop, adjusting, are_finite, meeting_flag, onto_edge
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.payments import is_tube
-from hjbjax.feedback.pushing import after_pushes
-from hjbjax.feedback.sudden_changes import after_changes
+from hjbjax.feedback.pushing import after_interventions, after_pushes
+from hjbjax.feedback.sudden_changes import after_chance
 from hjbjax.hamiltonian.derivatives import with_both_modes
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.types import Array, Control, Key, Number, State
@@ -182,9 +182,7 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
         shown = jax.tree.map(lambda a: jnp.where(active, a, jnp.nan), (u, d))
         return (t, y, code.astype(jnp.int32), count, extremes), (t, y[:-1], *shown, active)
 
-    y = jnp.append(x0, 0.0)
-    if loop.push is not None:  # not in the target, where the path has ended
-        y = jnp.where(loop.target(start, x0) <= 0, y, after_pushes(loop, start, y, start))
+    y = _begun(loop, start, x0)
     x0 = y[:-1]
     # the target comes last and wins: a start that is in the target and outside the box has reached the target
     code = jnp.where(loop.margin(x0) > 0, PathStatus.DURATION, PathStatus.LEFT_BOX)
@@ -193,8 +191,15 @@ def _intervals(ivp: InitialValueProblem, stepping: Stepping, reverse: bool = Fal
     extremes = jnp.asarray([jnp.inf, -jnp.inf], x0.dtype)
     if is_tube(loop.problem):
         extremes = _extremes(loop, start, (start[None], x0[None]), extremes)
-    y = after_changes(loop, start, y, start) if loop.clock else y
     return interval, (start, y, code, jnp.zeros((), jnp.int32), extremes)
+
+
+def _begun(loop: Loop, start: Number, x0: State) -> jax.Array:
+    """The state and the cost after the interventions at the first time; none are made in the target."""
+    y = jnp.append(x0, 0.0)
+    if loop.push is None and loop.switch is None:
+        return y
+    return jnp.where(loop.target(start, x0) <= 0, y, after_interventions(loop, start, y, start))
 
 
 def _extremes(loop: Loop, start: Number, seen: tuple[Array, Array], before: jax.Array) -> jax.Array:
@@ -227,8 +232,8 @@ def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: R
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count, extremes), (later, states, controls, disturbances, active) = last, shown
     hit, ended = code == PathStatus.TARGET, code == PathStatus.DURATION
-    if loop.clock:  # the mode may change at once
-        x0 = after_changes(loop, start, jnp.append(x0, 0.0), start)[:-1]
+    if loop.modes:  # the first mode is the one after the changes at the start, but the first state is ``x0``
+        x0 = jnp.asarray(x0).at[0].set(_begun(loop, start, x0)[0])
     times, states = jnp.append(start, later), jnp.concatenate([x0[None], states])
     # a path that leaves the box or fails pays nothing at its end
     due = jnp.where(hit, loop.paid_at_end(t, y[:-1]), loop.paid_at_last(t, y[:-1]))
@@ -264,7 +269,7 @@ def _through_changes(
         now = u if stepping.held else loop.players(begun, at[:-1])[0]
         later, moved, code, more, seen = _advance(loop, stepping, solve, (begun, end, last), at, now)
         changed = code == CHANGE
-        after = after_pushes(loop, later, after_changes(loop, later, moved, start), start)
+        after = after_interventions(loop, later, after_chance(loop, later, moved, start), start)
         moved = jnp.where(changed, after, moved)
         # a jump may lead into the target or out of the box
         ended, outside = loop.target(later, moved[:-1]) <= 0, loop.margin(moved[:-1]) <= 0

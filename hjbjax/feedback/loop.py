@@ -13,7 +13,6 @@ order 1 of the Euler scheme. If the noise acts only along the boundary (∇l'σ 
 a target in position), the path has a slope, and the interpolant of the step locates the target.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
@@ -25,8 +24,8 @@ import numpy as np
 from hjbjax.feedback.feedback import is_grid_feedback
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem, is_random
-from hjbjax.problem.pytree import altered, as_partial, pytree_dataclass
+from hjbjax.problem.problem import Problem, changes_at_random, is_random
+from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.problem.types import Array, Control, Disturbance, Key, Number, State
 from hjbjax.tracing import checks, closures
 
@@ -34,7 +33,6 @@ Event: TypeAlias = tuple[Number, State]  # a point of the path: its time and its
 Actions: TypeAlias = tuple[Control, Disturbance | None]  # of both players; no disturbance without an opponent
 
 HALVINGS = 30  # of the path back to the last point at which the players are defined: a billionth of an interval
-BEYOND = 1e30  # an end of the box that an entry of the state never reaches
 STREAM = 0x6272  # folded into the key, so that the draws are independent of the Brownian path, which splits the key
 NEWTON = 3  # steps onto the boundary of the target, whose function need not be linear
 EDGE = 1e-6  # the smallest share of a step before or after a meeting; shares of 0 and 1 would give no zero inside it
@@ -170,7 +168,7 @@ class Loop:
     def until_change(self, t: Number, x: State) -> jax.Array:
         """A function ≤ 0 where the mode or the state changes suddenly; inf if neither does."""
         left = jnp.asarray(jnp.inf, x.dtype)
-        if self.problem.mode_rates is not None or self.problem.intensities is not None:
+        if changes_at_random(self.problem):
             left = x[self.clock]
         return left if self.switch is None else jnp.minimum(left, self.switch(t, self.wrap(x))[0])
 
@@ -215,37 +213,6 @@ class Loop:
             final = problem.running_max if problem.stopping_cost is None else problem.stopping_cost
         paid = self.number(final, t, x)
         return paid if problem.stopping_cost is None else jnp.minimum(paid, self.number(problem.stopping_cost, t, x))
-
-
-def with_entry(loop: Loop, problem: Problem, x0: Any, first: Number) -> tuple[Loop, Any]:
-    """The loop of a problem with one more entry of the state, without bounds, and its start.
-
-    The players and the other functions of (t, x) do not see the last entry.
-
-    Args:
-      loop: the loop.
-      problem: the problem with the longer state.
-      x0: the start of the loop.
-      first: the entry at the start.
-    """
-    grid = loop.grid
-    if grid is not None:
-        lo, hi = jnp.append(jnp.asarray(grid.lo), -BEYOND), jnp.append(jnp.asarray(grid.hi), BEYOND)
-        grid = Grid(lo, hi, (*grid.shape, 2), (*grid.periodic, False))
-    names = ("control", "opponent", "surplus", "at_horizon", "switch")
-    seen: dict[str, Any] = {name: _of_shorter(getattr(loop, name)) for name in names}
-    xp: Any = np if isinstance(x0, np.ndarray) and not isinstance(first, jax.Array) else jnp
-    start = xp.append(x0, xp.asarray(first, x0.dtype))
-    return dataclasses.replace(loop, problem=problem, grid=grid, **seen), start
-
-
-def _of_shorter(function: Callable | None) -> jax.tree_util.Partial | None:
-    """A function of (t, x) as a function of (t, (x, entry))."""
-    return None if function is None else jax.tree_util.Partial(_look, as_partial(function))
-
-
-def _look(function: Callable, t: Number, y: State) -> Array:
-    return function(t, y[:-1])
 
 
 def are_finite(actions: Actions) -> jax.Array:

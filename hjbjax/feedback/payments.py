@@ -21,6 +21,7 @@ import numpy as np
 from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
+from hjbjax.problem.mode_axis import over_modes
 from hjbjax.problem.problem import Problem, is_discounted, is_random
 from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
@@ -218,9 +219,8 @@ def broken_promise(
     ahead = still_ahead(problem, feedback, path, weight, to_horizon=to_horizon)
     if ahead is None or not np.all(inside[:-1]):
         return None
-    total, promised = _combined(problem, float(path.cost), ahead), promise(feedback, states[0])
-    assert promised is not None
-    off = total - promised
+    promised = path.promised if path.payoff == COST else 0 - path.promised
+    off = _combined(problem, float(path.cost), ahead) - promised
     if off <= 0 and not worst_case:
         return None
     if abs(off) <= _allowed(solution) or abs(off) <= LEAST * _range_of_extremes(problem, solution):
@@ -242,9 +242,9 @@ def _is_answer_to(problem: Problem, solution: Solution, path: Path) -> bool:
 
     V of another problem, for example with a nominal drift or another cost, promises nothing.
     """
-    posed = solution.problem
-    if posed is None:  # loaded from a file or constructed by hand
+    if solution.problem is None:  # loaded from a file or constructed by hand
         return True
+    posed = over_modes(solution.problem, len(solution.grid.state_axes))
     if (posed.is_game, posed.time_dependent) != (problem.is_game, problem.time_dependent) or not len(path.controls):
         return False
     x, d = jnp.asarray(path.states[0]), None if path.disturbances is None else jnp.asarray(path.disturbances[0])

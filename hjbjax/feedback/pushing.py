@@ -1,4 +1,6 @@
-"""Pushes along a path: the jump at its start, and the reflection at the free boundary afterwards.
+"""Interventions along a path: changes of the mode by choice, and pushes.
+
+A push is a jump at the start of a path, and the reflection at the free boundary afterwards.
 
 After every step of the integrator the state is moved along the pushes of the solution to the boundary of the push
 region, and the cost of the way is paid, discounted to the start. On the grid the boundary consists of the first nodes
@@ -21,8 +23,9 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.discretisation.stencil import grid_links
 from hjbjax.feedback.loop import Loop
 from hjbjax.feedback.payments import Lookup, solution_of
+from hjbjax.feedback.sudden_changes import after_choice
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import cast, is_traced
+from hjbjax.problem.pytree import altered, cast, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import Field, Mask, Number
@@ -48,7 +51,8 @@ def push_table(problem: Problem, feedback: object) -> Lookup | None:
     folded: Any = jax.ensure_compile_time_eval() if known else contextlib.nullcontext()
     with folded, own_settings(x64=double):
         n, dtype = solution.grid.ndim, np.result_type(solution.value)
-        ready = cast(settled(with_any_control(problem, n), n, dtype), dtype)
+        only_pushes = altered(problem, switching_costs=None)  # changes of the mode are made apart
+        ready = cast(settled(with_any_control(only_pushes, n), n, dtype), dtype)
         on = Discretisation(ready, cast(solution.grid, dtype), Upwind(), dtype)
         masks = jnp.moveaxis(jnp.asarray(solution.pushing), -1, 0)  # (p, *grid), or (p, k, *grid)
         if solution.times is None:
@@ -88,6 +92,20 @@ def _ways(on: Discretisation, masks: Mask) -> Field:
     return jnp.stack([*ways, total(list(pushes.costs))], axis=-1)
 
 
+def after_interventions(loop: Loop, t: Number, y: jax.Array, start: Number) -> jax.Array:
+    """The state and the running cost after all changes of the mode and pushes that are chosen at the time t."""
+    if loop.switch is None or loop.push is None:
+        for _ in range(max(loop.modes - 1, 0)):  # a cheapest path of changes has at most k − 1 of them
+            y = after_choice(loop, t, y, start)
+        return after_pushes(loop, t, y, start)
+
+    def again(_: int, y: jax.Array) -> jax.Array:
+        return after_pushes(loop, t, after_choice(loop, t, y, start), start)
+
+    # a push may lead to a change and a change to a push: twice through all modes
+    return jax.lax.fori_loop(0, 2 * loop.modes, again, y)
+
+
 def after_pushes(loop: Loop, t: Number, y: jax.Array, start: Number) -> jax.Array:
     """The state and the running cost after the pushes that are due at the time t; unchanged without pushes.
 
@@ -99,10 +117,6 @@ def after_pushes(loop: Loop, t: Number, y: jax.Array, start: Number) -> jax.Arra
     """
     if loop.push is None:
         return y
-    n = loop.push.grid.ndim
-    found = jnp.asarray(loop.push(t, loop.wrap(y[:-1])[:n]), y.dtype)
-    weight = loop.discount(jnp.asarray(t - start, y.dtype))
-    known = n + 2 * (loop.clock > 0)  # the state, then clock and count of sudden changes
-    if y.size > known + 1:  # the discount is a function of the state, see ``discounting``
-        weight = weight * jnp.exp(-y[known])
-    return y.at[:n].add(found[:n]).at[-1].add(weight * found[n])
+    found = jnp.asarray(loop.push(t, loop.wrap(y[:-1])), y.dtype)  # further entries of the state are not pushed
+    n = found.size - 1
+    return y.at[:n].add(found[:n]).at[-1].add(loop.discount(jnp.asarray(t - start, y.dtype)) * found[n])

@@ -326,8 +326,6 @@ def _over_modes(
         raise ValueError("simulate: got running_max with modes or jumps; the cost of such a path is not computed")
     if modes is None:
         return over_checked_modes(problem, n), feedback, disturbance, grid
-    if problem.pushes:
-        raise ValueError("simulate: got modes and pushes; paths with both are not computed. Leave out one of them")
     players = (of_mode(player, modes) for player in (feedback, disturbance))
     return over_checked_modes(problem, n), *players, grid_of_modes(grid, modes)
 

@@ -18,43 +18,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.feedback.loop import Loop, with_entry
+from hjbjax.feedback.longer_states import with_entries
+from hjbjax.feedback.loop import Loop
 from hjbjax.feedback.path import Path
 from hjbjax.feedback.payments import Lookup, solution_of
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.mode_axis import with_modes
 from hjbjax.problem.modes import Modes
-from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, as_partial, pytree_dataclass
+from hjbjax.problem.problem import Problem, changes_at_random
 from hjbjax.problem.types import Array, Key, Number
 
 STREAM = 0x6D6F  # folded into the key, so that the draws are independent of the other draws of a path
-OF_STATE = ("exit_cost", "terminal_cost", "stopping_cost", "target", "switching_costs")
-OF_ACTION = ("cost", "mode_rates", "intensities", "landings", "jump_costs")
-
-
-@pytree_dataclass(static=("name",))
-class Clocked:
-    """A function of a problem as a function of the state with clock and count."""
-
-    problem: Problem
-    name: str
-
-    def __call__(self, *arguments: Any) -> Array:
-        """The value at the problem's arguments, with clock and count at the end of the state."""
-        problem, place = self.problem, int(self.problem.time_dependent)
-        z = arguments[place][:-2]
-        own = (*arguments[:place], z, *arguments[place + 1 :])
-        if self.name == "noise":
-            t = own[0] if place else 0.0
-            sigma = problem.diffusion(z, own[place + 1], own[place + 2] if problem.is_game else None, t)
-            return jnp.pad(sigma, ((0, 2), (0, 0)))
-        ingredient = getattr(problem, self.name)
-        found = ingredient(*own) if callable(ingredient) else ingredient
-        if self.name != "drift":
-            return found
-        leaving = jnp.sum(rates_of_changes(problem, own, z.dtype))
-        return jnp.concatenate([jnp.asarray(found, z.dtype), jnp.stack([-leaving, jnp.zeros((), z.dtype)])])
 
 
 def rates_of_changes(problem: Problem, arguments: tuple, dtype: Any) -> Array:
@@ -110,19 +84,16 @@ def with_clock(loop: Loop, x0: Any, key: Key | None, count: int) -> tuple[Loop, 
     problem = loop.problem
     if not has_clock(problem, count):
         return loop, x0
-    names = ["drift", *(name for name in (*OF_ACTION, *OF_STATE) if getattr(problem, name) is not None)]
-    names += ["discount"] * callable(problem.discount)
-    changed: dict[str, Any] = {name: as_partial(Clocked(problem, name)) for name in names}
-    if callable(problem.noise):
-        changed["noise"] = as_partial(Clocked(problem, "noise"))
-    elif problem.noise is not None:
-        changed["noise"] = jnp.pad(problem.diffusion(jnp.zeros(np.shape(x0)), jnp.zeros(0)), ((0, 2), (0, 0)))
-    none = jnp.zeros((), x0.dtype)
-    longer, start = loop, x0
-    by_chance = problem.mode_rates is not None or problem.intensities is not None
-    for first in (draws(key, none)[1] if by_chance else jnp.ones((), x0.dtype), none):
-        longer, start = with_entry(longer, altered(problem, **changed), start, first)
+    none = np.zeros((), x0.dtype)
+    clock = draws(key, jnp.asarray(none))[1] if changes_at_random(problem) else np.ones((), x0.dtype)
+    longer, start = with_entries(loop, x0, (clock, none), _motion)
     return dataclasses.replace(longer, modes=count, clock=len(x0), key=key), start
+
+
+def _motion(problem: Problem, arguments: tuple) -> Array:
+    """The rates of change of clock and count."""
+    dtype = arguments[int(problem.time_dependent)].dtype
+    return jnp.stack([-jnp.sum(rates_of_changes(problem, arguments, dtype)), jnp.zeros((), dtype)])
 
 
 def draws(key: Key | None, n: jax.Array) -> tuple[Array, Array]:
@@ -132,28 +103,31 @@ def draws(key: Key | None, n: jax.Array) -> tuple[Array, Array]:
     return jax.random.uniform(which, (), n.dtype), jax.random.exponential(when, (), n.dtype)
 
 
-def after_changes(loop: Loop, t: jax.Array, y: jax.Array, start: Number) -> jax.Array:
-    """The state and the running cost after the sudden changes that are due at the time t.
+def after_chance(loop: Loop, t: jax.Array, y: jax.Array, start: Number) -> jax.Array:
+    """The state and the running cost after the random change that is due at the time t.
 
     Args:
-      loop: the loop with its clock.
+      loop: the loop.
       t: the time.
       y: the state of the loop, then the running cost.
       start: the first time of the path, where discounting starts.
     """
-    x, cost, problem = y[:-1], y[-1], loop.problem
-    if problem.mode_rates is not None or problem.intensities is not None:
-        x, paid = _after_chance(loop, t, x)
-        cost = cost + loop.discount(t - start) * paid
-    if loop.switch is not None:
-        for _ in range(loop.modes - 1):  # a cheapest path of changes has at most k − 1 of them
-            surplus = loop.switch(t, loop.wrap(x))
-            number = 1 + jnp.argmin(surplus[1:])
-            costs = jnp.asarray(problem.switching_costs(*problem.state_arguments(loop.wrap(x), t)), x.dtype)
-            due = surplus[0] <= 0
-            cost = cost + jnp.where(due, loop.discount(t - start) * costs[number - 1], 0)
-            x = jnp.where(due, _in_mode(loop, x, number), x)
-    return jnp.append(x, cost)
+    if not changes_at_random(loop.problem):
+        return y
+    x, paid = _after_chance(loop, t, y[:-1])
+    return jnp.append(x, y[-1] + loop.discount(t - start) * paid)
+
+
+def after_choice(loop: Loop, t: Number, y: jax.Array, start: Number) -> jax.Array:
+    """The state and the running cost after the change of the mode that the controller makes at the time t."""
+    if loop.switch is None:
+        return y
+    x, problem = y[:-1], loop.problem
+    surplus = loop.switch(t, loop.wrap(x))
+    number, due = 1 + jnp.argmin(surplus[1:]), surplus[0] <= 0
+    costs = jnp.asarray(problem.switching_costs(*problem.state_arguments(loop.wrap(x), t)), x.dtype)
+    cost = y[-1] + jnp.where(due, loop.discount(jnp.asarray(t - start, x.dtype)) * costs[number - 1], 0)
+    return jnp.append(jnp.where(due, _in_mode(loop, x, number), x), cost)
 
 
 def _after_chance(loop: Loop, t: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:

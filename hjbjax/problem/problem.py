@@ -262,9 +262,13 @@ def is_discounted(problem: Problem) -> bool | None:
 
 def is_random(problem: Problem) -> bool:
     """True if paths of the problem are random: noise, jumps, or random changes of the mode."""
+    return problem.noise is not None or changes_at_random(problem)
+
+
+def changes_at_random(problem: Problem) -> bool:
+    """True if the state jumps or the mode changes at random times."""
     jumps = bool(problem.jumps) or problem.intensities is not None
-    changes = problem.mode_rates is not None or (problem.modes is not None and problem.modes.rates is not None)
-    return problem.noise is not None or jumps or changes
+    return jumps or problem.mode_rates is not None or (problem.modes is not None and problem.modes.rates is not None)
 
 
 def is_constrained(problem: Problem) -> bool:

@@ -36,23 +36,26 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType) -> in
     lives. Sweeps store the weights (one per axis without noise, two with noise) and the source twice, plain and skewed,
     in single precision. A Krylov method stores its vectors.
     """
-    word, n, actions = np.dtype(dtype).itemsize, grid.ndim, _actions(problem)
-    searched = _searched(problem, n, dtype)
+    word, n, actions = np.dtype(dtype).itemsize, len(grid.state_axes), _actions(problem)
+    searched, choices = _searched(problem, grid.ndim, dtype), _choices(problem, grid)
     if method.relaxes and not method.policy:
         # the initial V, V, the step, V at the start of a chunk, and on few axes the neighbours along the last one
-        return word * (4 + (n <= stencil.LONGER) + searched) * grid.size
+        stored = 4 + (grid.ndim <= stencil.LONGER) + searched + choices + _imposing(choices)
+        return math.ceil(word * stored) * grid.size
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
     # V, its defect, the actions, prescribed values or bounds at the nodes, the least cost if it gives the certificate,
     # and two one-byte masks: the fixed nodes and the counted nodes
     kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
+    kept += word * choices
     look, correction = word * (4 + 2 * actions), 0
     if method.evaluation is not None and not method.relaxes:
         # 2n jumps along the axes and four diagonal ones for each pair of axes
         weights = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
         if problem.noise is None and method.evaluation.rough:
             weights = n  # one direction per axis, since sweeps may merge both
-        weights += _sudden(problem, grid, dtype)
-        correction = method.evaluation.bytes_per_node(weights, word)
+        weights += _sudden(problem, grid, dtype, near=method.evaluation.rough)
+        correction = method.evaluation.bytes_per_node(weights, word) + word * 3 * (choices > 0)
+        look = max(look, word * (10 + 2 * choices) * (choices > 0))  # also the nodes of every intervention
     elif is_discounted(problem) and not searched:
         # the actions, computed at the end, and the outflow Q + β; a step computes only the defect
         look = word * (actions + 1 + (problem.noise is not None or is_constrained(problem)))
@@ -61,6 +64,7 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType) -> in
         if problem.stopping_cost is not None and not problem.is_game and is_discounted(problem) is False:
             # on ties the old policy is kept, which requires every rate
             look = max(look, math.ceil(word * (2.5 * n + actions)))
+    look = max(look, math.ceil(word * _imposing(choices)))
     return (kept + max(look + word * searched, correction)) * grid.size
 
 
@@ -86,7 +90,8 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
         slopes = 6.0 * n
     given = sum(each is not None for each in (problem.exit_cost, problem.stopping_cost, problem.running_max))
     stored = word * given + 1 if policy else 0
-    steps = word * (3 + slopes + _searched(problem, n, on.dtype))
+    choices = _choices(problem, grid)
+    steps = word * (3 + slopes + _searched(problem, n, on.dtype) + choices + _imposing(choices))
     filling = one + word  # the last term is V itself
     if policy:
         wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or plain else 6
@@ -94,13 +99,26 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     return math.ceil(((kept - 1) * one + stored + max(steps, filling)) * grid.size)
 
 
-def _sudden(problem: Problem, grid: Grid, dtype: DType) -> int:
-    """Weights per node for sudden changes: jumps between k modes, their inverse, and the corners of landings."""
-    count = len(grid.modes)
-    corners = 2 ** len(grid.state_axes)
+def _sudden(problem: Problem, grid: Grid, dtype: DType, *, near: bool) -> int:
+    """Weights per node for sudden changes: jumps between k modes, their inverse, and the corners of landings.
+
+    ``near``: True for an evaluation that only relaxes, which stores neither the inverse nor the landings.
+    """
+    count, n = len(grid.modes), len(grid.state_axes)
+    if near:
+        return count
     jumps = 0 if problem.landings is None else len(influence(problem, grid.ndim, dtype).landing.entries)
-    # an index takes half of a word
-    return 2 * count + math.ceil(1.5 * corners * jumps / max(len(grid.state_axes), 1))
+    return 2 * count + math.ceil(1.5 * 2**n * jumps / n)  # an index takes half of a word
+
+
+def _choices(problem: Problem, grid: Grid) -> int:
+    """The number of interventions: changes of the mode by choice, and pushes; the cost of each is stored."""
+    return (len(grid.modes) - 1) * (problem.switching_costs is not None) + len(problem.push_steps)
+
+
+def _imposing(choices: int) -> float:
+    """Words per node for V after each intervention, and for the lines along which they follow each other."""
+    return 3.5 + 1.5 * choices if choices else 0
 
 
 def _actions(problem: Problem) -> int:
@@ -224,19 +242,23 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     checks.check_indices(grid)
     # memory is proportional to the number of nodes
     if free is not None and needed > free:
-        each = max(len(grid.modes), 1)
         raise MemoryError(
             f"{as_counts(grid)} = {grid.size:,} nodes need about {needed / 1e9:.3g} GB, {free / 1e9:.3g} GB are free.\n"
-            f"{_largest(free / needed * grid.size / each, len(grid.state_axes))}; max_memory= (bytes) overrides what "
-            "counts as free.\n"
+            f"{_largest(free / needed * grid.size, grid)}; max_memory= (bytes) overrides what counts as free.\n"
             f"dtype='float32' takes about half; {NO_GRID}."
         )
     return needed
 
 
-def _largest(nodes: float, n: int) -> str:
-    """A sentence with the points per axis of the largest grid with n axes and this number of nodes."""
-    largest = math.floor(nodes ** (1 / n))
+def points_per_axis(nodes: float, grid: Grid) -> int:
+    """The points along every axis of the state, in a grid with the same axes and modes and this number of nodes."""
+    # an exact root may be rounded down
+    return math.floor((nodes / max(len(grid.modes), 1)) ** (1 / len(grid.state_axes)) * (1 + 1e-12))
+
+
+def _largest(nodes: float, grid: Grid) -> str:
+    """A sentence with the points per axis of the largest grid with the same axes and this number of nodes."""
+    largest, n = points_per_axis(nodes, grid), len(grid.state_axes)
     if largest < 2:
         return f"Not even two points per axis would fit in {n}-D"
     return f"About N = {largest} points per axis would fit in {n}-D"

@@ -36,10 +36,11 @@ class Estimate:
     """Estimated resources of a solve.
 
     Attributes:
-      shape: the number of nodes per axis.
+      shape: the number of nodes per axis; with modes their number comes first.
       bytes: peak memory on the device.
       free: free bytes on the device; ``None`` if unknown.
-      largest: points per axis of the largest grid with this number of axes that fits; ``None`` if unknown.
+      largest: points per axis of the state, in the largest grid with the same axes and modes that fits; ``None`` if
+        unknown.
       programs: the number of compiled loops, one per grid and scheme.
       steps: improvements on the finest grid; ``None`` if the small grids could not be solved.
       seconds: the time of all steps, usually within a factor of three.
@@ -134,7 +135,8 @@ def estimate(
             needed, programs = semi_lagrangian.arc_bytes(grid, paths.plan(problem, grid, kind), kind), 1
     else:
         needed, programs = memory.peak_bytes(problem, grid, chosen.inner, kind), _programs(grid, chosen, scheme)
-    about = Estimate(grid.shape, needed, free, _largest(needed, free, grid), programs)
+    largest = None if free is None else memory.points_per_axis(min(free / needed * grid.size, INDEXABLE - 1), grid)
+    about = Estimate(grid.shape, needed, free, largest, programs)
     if not measure:
         return dataclasses.replace(about, note="nothing was measured")
     tried = _tried(grid)
@@ -151,7 +153,7 @@ def estimate(
             )
     coarse, fine = found
     ratio, beyond = max(tried[1].size / tried[0].size, 1 + 1e-9), grid.size / tried[1].size
-    most = 2 / grid.ndim  # per step a front moves one cell, and noise needs N steps to spread over √N cells
+    most = 2 / len(grid.state_axes)  # per step a front moves one cell, and noise needs N steps to spread over √N cells
     seconds = [max(each.stats["seconds"], 1e-4) for each in found]
     growth = 1 + np.clip(np.log(seconds[1] / seconds[0]) / np.log(ratio) - 1, 0, most)
     climb = np.clip(np.log(max(fine.steps, 1) / max(coarse.steps, 1)) / np.log(ratio), 0, most)
@@ -161,15 +163,6 @@ def estimate(
         seconds=float(seconds[1] * beyond**growth),
         compile_seconds=float(max(each.stats["compile_seconds"] for each in found)),
     )
-
-
-def _largest(needed: int, free: int | None, grid: Grid) -> int | None:
-    """The points per axis of the largest grid with the same number of axes that fits."""
-    if free is None:
-        return None
-    nodes = min(free / needed * grid.size, INDEXABLE - 1)
-    # an exact root may be rounded down
-    return math.floor(nodes ** (1 / grid.ndim) * (1 + 1e-12))
 
 
 def _programs(grid: Grid, method: Method, scheme: Scheme | None) -> int:
@@ -188,7 +181,7 @@ def _tried(grid: Grid) -> tuple[Grid, Grid]:
 
 def _smaller(grid: Grid, nodes: float) -> Grid:
     """The grid with about this number of nodes; an axis with a node in its middle keeps it."""
-    share, shape = (nodes / grid.size) ** (1 / grid.ndim), []
+    share, shape = (nodes / grid.size) ** (1 / len(grid.state_axes)), []
     for axis, count in enumerate(grid.shape):
         if axis not in grid.state_axes:
             shape.append(count)

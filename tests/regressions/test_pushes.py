@@ -266,6 +266,47 @@ def test_a_path_with_a_discount_that_depends_on_the_state():
     assert abs(again.reward - hjb.simulate(firm(), found, [1.2], 3.0, key=1).reward) <= 1e-3
 
 
+def regimes(*, noise=None, rates=None, discount=0.5):
+    """Two regimes; a change from the second to the first and all pushes are choices."""
+    return hjb.Problem(
+        lambda x, u, mode: (0.3, -0.2)[mode] + 0 * x, lambda x, u, mode: (1.0, 4.0)[mode] * x[0] ** 2,
+        noise=noise, discount=discount, modes=hjb.Modes(("calm", "wild"), rates, [[0, np.inf], [0.4, 0]]),
+        pushes=[
+            hjb.Push([-1.0], lambda x, mode: (1.0, 0.6)[mode]), hjb.Push([1.0], lambda x, mode: (0.5, 1.4)[mode])
+        ],
+    )  # fmt: skip
+
+
+WIDE = hjb.Grid([-2.0], [2.0], (201,))
+
+
+def test_a_path_with_modes_and_pushes_costs_its_value():
+    problem = regimes()
+    found = hjb.solve(problem, WIDE, tol=1e-8)
+    for start, mode, first in ((-1.3, "wild", 0), (1.9, "wild", 1), (-1.7, "calm", 0), (0.9, "calm", 0)):
+        path = hjb.simulate(problem, found, [start], 20.0, mode=mode)
+        assert abs(path.cost - found.value_at([start], mode=mode)) <= 0.01
+        assert path.modes[0] == first  # after the changes and pushes at the start
+        assert path.states[0, 0] == start
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize("discount", [0.5, lambda x, mode: (0.4, 0.5)[mode] + 0.1 * x[0] ** 2])
+def test_means_with_modes_and_pushes_agree_with_the_value(discount):
+    problem = regimes(noise=0.3, rates=[[0, 0.4], [0.6, 0]], discount=discount)
+    found, times = hjb.solve(problem, WIDE, tol=1e-7), jnp.linspace(0.0, 16.0, 41)
+    keys = jax.random.split(jax.random.key(3), 400)
+    with jax.enable_x64(True):
+        run = jax.jit(
+            jax.vmap(lambda key, x: rollout(problem, found, x, times, key=key, mode=1, max_step=0.02).cost, (0, None))
+        )
+        for start in (-1.3, 1.2):
+            costs = np.asarray(run(keys, jnp.array([start])))
+            spread = 3 * np.std(costs) / np.sqrt(len(keys))
+            assert abs(np.mean(costs) - found.value_at([start], mode=1)) <= spread + 0.01
+
+
 def bowl(pushes, **others):
     return hjb.Problem(lambda x, u: 0 * x, lambda x, u: x @ x, pushes=pushes, **({"discount": 0.5} | others))
 

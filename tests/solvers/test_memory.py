@@ -13,8 +13,10 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.posing import for_solvers
 from hjbjax.iteration import fixed_point
 from hjbjax.problem.arguments import INDEXABLE
+from hjbjax.problem.mode_axis import with_modes
 from hjbjax.problem.pytree import cast
 from hjbjax.solvers import memory, stationary_run
 from hjbjax.solvers.setup import assumptions_of, prepare
@@ -72,6 +74,38 @@ def test_the_estimate_is_what_the_compiled_loop_needs(n, noise, method):
     )
     grid = hjb.Grid([-1.0] * n, [1.0] * n, ({2: 121, 3: 41}[n],) * n)
     assert 0.95 <= told_over_needed(problem, grid, method) <= 1.4
+
+
+def sudden(n, *, noise):
+    """Three modes between which the system and the controller change, a push in every direction, and a jump."""
+    pushes = [hjb.Push(sign * direction, 1.0) for direction in np.eye(n) for sign in (1, -1)]
+    table = 1 - np.eye(3)
+    return hjb.Problem(
+        lambda x, u, mode: (1 + 0.1 * mode) * jnp.concatenate([x[1:], u]), lambda x, u, mode: cost(x, u),
+        hjb.Box([-1.0], [1.0]), noise=noise, discount=1.0, modes=hjb.Modes(("a", "b", "c"), table, table),
+        pushes=pushes, jumps=[hjb.Jump(1.0, lambda x, u, mode: x / 2)],
+    )  # fmt: skip
+
+
+@pytest.mark.emitters  # the old ones store more arrays than the program that users run
+@pytest.mark.parametrize("method", [*METHODS, hjb.ValueIteration(policy=False)])
+@pytest.mark.parametrize("n", [1, 2])
+def test_modes_jumps_and_pushes_are_counted(n, method):
+    grid = hjb.Grid([-1.0] * n, [1.0] * n, ({1: 4001, 2: 61}[n],) * n)
+    problem, grid = for_solvers(sudden(n, noise=0.3), n), with_modes(grid, ("a", "b", "c"))
+    assert 0.85 <= told_over_needed(problem, grid, method) <= 1.4
+
+
+def test_the_largest_grid_with_modes_is_named_per_axis_of_the_state():
+    problem = sudden(2, noise=0.3)
+    free = hjb.estimate(problem, square(201), measure=False)
+    assert free.shape == (3, 201, 201)
+    with pytest.raises(MemoryError, match=r"in 2-D") as caught:
+        hjb.solve(problem, square(20_001), max_memory=10**9)
+    largest = int(re.search(r"N = (\d+)", str(caught.value))[1])
+    for count, fits in ((largest, True), (largest + 1, False)):
+        bytes_needed = hjb.estimate(problem, square(count), measure=False).bytes
+        assert (bytes_needed <= 10**9) == fits
 
 
 @pytest.mark.parametrize("method", METHODS[:2])

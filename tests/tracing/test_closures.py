@@ -469,13 +469,13 @@ def test_transformed_library_code_is_not_even_traced():
         jumps=[hjb.Jump(0.3, still)],
     )  # fmt: skip
     for name in ("drift", "cost", "intensities", "landings"):
-        function = getattr(posing._for_solvers(problem, 1), name)
+        function = getattr(posing.for_solvers(problem, 1), name)
         assert identity(unnested(function)) is not None, name
     halved = hjb.Problem(square, reward=lambda x, u, half=0.5: half * x[0], controls=hjb.Box([-1.0], [1.0]))
     number = 0.5
     read = hjb.Problem(square, reward=lambda x, u: number * x[0], controls=hjb.Box([-1.0], [1.0]))
-    assert identity(unnested(posing._for_solvers(halved, 1).cost)) is not None
-    assert identity(unnested(posing._for_solvers(read, 1).cost)) is None  # the number may change
+    assert identity(unnested(posing.for_solvers(halved, 1).cost)) is not None
+    assert identity(unnested(posing.for_solvers(read, 1).cost)) is None  # the number may change
 
 
 def test_what_cannot_be_traced_is_left_to_the_checks():

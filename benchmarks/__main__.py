@@ -30,6 +30,7 @@ NAMES = {
     "memory": ("accuracy", "the memory estimate against the peak of separate processes"),
     "mutants": ("accuracy", "fifteen seeded bugs: the test of the default suite that finds each of them"),
     "quoted": ("harness", "the table of measurements in the documentation, from the recorded rows"),
+    "charts": ("harness", "the pictures of all recorded rows"),
     "recorded": ("harness", "every recorded row, as Markdown tables"),
     "bounds": (
         "accuracy",

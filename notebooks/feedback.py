@@ -17,7 +17,8 @@
 #
 # $$m\ddot\theta - m g\sin\theta = \tau. \qquad (2.1)$$
 #
-# Figure 3 of the chapter shows the pendulum. Below it falls without a torque and is stabilised by feedback.
+# Figure 3 of the chapter shows the pendulum. Below it falls without a torque, one feedback cancels gravity, and a
+# second one stabilises it. Figures 4 and 5 of the chapter are the block diagrams of these two loops.
 
 # %%
 import jax.numpy as jnp
@@ -54,7 +55,7 @@ ax.set_axis_off()
 plt.show()
 
 # %% [markdown]
-# ## Figure 4: without a torque
+# ## Without a torque
 #
 # Upright is an unstable equilibrium: the linearisation has the eigenvalues $\pm\sqrt g$. A pendulum that is released
 # near upright swings through the hanging position and back. Its energy $\tfrac12\dot\theta^2 + g\cos\theta$ is
@@ -71,9 +72,45 @@ plotting.trajectory(fall, ax=ax, axes=None, grid=grid)
 plt.show()
 
 # %% [markdown]
-# ## Figure 5: with feedback
+# ## Figure 4: the loop that cancels gravity
 #
-# The torque of (2.8) cancels gravity and adds friction and a spring:
+# The inner loop (2.6) makes the system from the new input $v$ to the angle linear, $m\ddot\theta = v$:
+#
+# ```text
+#  v     +---+   τ    +----------+  θ, θ'
+# ----->( + )-------->| pendulum |----+---->
+#         ^           +----------+    |
+#         |   +-----------------+     |
+#         +---|   - m g sin θ   |<----+
+#             +-----------------+
+# ```
+#
+# It does not stabilise anything. With $v = 0$ the angle grows linearly.
+
+# %%
+floating = hjb.simulate(
+    problem, lambda x: jnp.stack([-9.81 * jnp.sin(x[0])]), [0.6, 0.2], duration, rtol=1e-8, atol=1e-8
+)
+away = np.abs(floating.states[:, 0] - (0.6 + 0.2 * floating.times)).max()
+print(f"largest distance from a straight line {away:.1e}")
+assert away < 1e-6
+
+# %% [markdown]
+# ## Figure 5: the stabilised loop
+#
+# An outer loop adds friction and a spring, $v = -k_1\dot\theta - k_2\theta$. Together they are the torque (2.8):
+#
+# ```text
+#          +---+   τ    +----------+  θ, θ'
+#        ( + )--------->| pendulum |----+------>
+#          ^ ^          +----------+    |
+#          | |   +-----------------+    |
+#          | +---|   - m g sin θ   |<---+
+#          |     +-----------------+    |
+#          |   v +-----------------+    |
+#          +-----|  - k₁ θ' - k₂ θ |<---+
+#                +-----------------+
+# ```
 #
 # $$\tau = -m g\sin\theta - k_1\dot\theta - k_2\theta.$$
 #

@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.linalg import expm
 
 import hjbjax as hjb
 from hjbjax import filtering, plotting
@@ -36,6 +37,52 @@ warnings.simplefilter("ignore", hjb.SolveWarning)  # coarse grids are accurate e
 
 # %% [markdown]
 # ## Figure 13: an estimate in the loop
+#
+# ```text
+#        +-------+   x   +--------+   y
+#   +--->| plant |------>| sensor |------+
+#   |    +-------+       +--------+      |
+#   | u                                  v
+#   |    +----------+    x̂     +----------+
+#   +----|  u*(x̂)   |<----------| observer |
+#        +----------+           +----------+
+# ```
+#
+# The simplest observer is Luenberger's (12.3), a copy of the plant that is corrected by the measurement error. The
+# control (12.4) is the optimal feedback at the estimate. For a mass of which only the position is measured, the error
+# obeys $\dot e = (A - GC)e$, whatever the control is; the gain places its poles at −2 and −3.
+
+
+# %%
+def mass(x, u):
+    return jnp.stack([x[1], u[0]])
+
+
+def position(x):
+    return x[:1]
+
+
+free = hjb.Problem(mass, controls=hjb.Box([-8.0], [8.0]))
+luenberger = filtering.Luenberger(free, position, [[5.0], [6.0]], [0.0, 0.0])
+held = filtering.simulate_output(
+    free,
+    luenberger,
+    lambda x: -x[:1] - np.sqrt(3) * x[1:],
+    h=position,
+    x0=[1.0, 0.5],
+    duration=6.0,
+    dt=0.05,
+    key=0,
+    measurement_noise=0.0,
+)
+error = held.estimates - held.states
+expected = np.array([expm(np.array([[-5.0, 1.0], [-6.0, 0.0]]) * t) @ error[0] for t in held.times])
+print(f"the error follows the linear system up to {np.abs(error - expected).max():.1e}")
+assert np.abs(error - expected).max() < 0.01
+assert np.abs(held.states[-1]).max() < 0.1
+
+# %% [markdown]
+# ## A pendulum that is seen by an encoder
 #
 # Only the angle of a pendulum is measured. The torque is at most 0.7 times the largest torque of gravity, so the
 # pendulum has to be swung up. The value function is computed as if the state were known, and an extended Kalman filter
@@ -77,6 +124,17 @@ assert np.max(np.abs(np.sin(path.estimates[50:, 0] - path.states[50:, 0]))) < 0.
 # %% [markdown]
 # ## Figure 14: the law of the state
 #
+# ```text
+#        +-------+   x   +--------+   y
+#   +--->| plant |------>| sensor |------+
+#   |    +-------+       +--------+      |
+#   | u                                  v
+#   |    +----------+    σ     +-------------------+
+#   +----|   u(σ)   |<---------| law of the state  |
+#        +----------+          | given the record  |
+#                              +-------------------+
+# ```
+#
 # If the sensor measures $x^2$, two states fit every record. A Kalman filter follows one of them. The law on a grid,
 # from the Duncan–Mortensen–Zakai equation (12.6), contains both until the drift distinguishes them.
 
@@ -103,6 +161,17 @@ assert law.density.min() >= 0
 
 # %% [markdown]
 # ## Figure 15: the robust information state and its gain
+#
+# ```text
+#    w   +-------+   x   +--------+   y
+#  ----->| plant |------>| sensor |<----- v
+#   +--->|       |       +--------+------+
+#   | u  +-------+                       v
+#   |    +-------------+    p    +------------------+
+#   +----| u*(x̄), where |<--------| worst cost so far |
+#        | p + V is max |         |  given the record |
+#        +-------------+         +------------------+
+# ```
 #
 # For $\dot x = x + u + w$, $y = 2x + v$ with cost $\tfrac12\int x^2 + u^2$, the Kalman filter with the regulator's gain
 # is optimal for white noise. The minimum-stress controller acts as if the state were the maximiser of $p + V$, where

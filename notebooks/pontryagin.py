@@ -53,6 +53,28 @@ print(f"cost by dynamic programming {solution.value_at(0.0, start):.4f}, by Pont
 assert abs(solution.value_at(0.0, start) - extremal.cost) < 0.01
 
 # %% [markdown]
+# ## The principle of optimality
+#
+# Dynamic programming rests on (8.10): an optimal path remains optimal from every later state. So the cost paid up to a
+# time $r$ plus the value of the state at that time is the same number for all $r$, and it is larger for another
+# control:
+#
+# $$V(x_0, 0) = \inf_u \Big[\int_0^r L(x, u)\,dt + V(x(r), r)\Big].$$
+
+# %%
+sums = {}
+for name, control in {"optimal": solution, "twice as strong": lambda t, x: 2 * solution.control_at(t, x)}.items():
+    varying = {} if control is solution else {"time_varying": True}
+    path = hjb.simulate(problem, control, start, 3.0, steps=60, **varying)
+    rates = 0.5 * (np.sum(path.states[:-1] ** 2, axis=1) + np.sum(path.controls**2, axis=1))
+    paid = np.append(0.0, np.cumsum(rates * np.diff(path.times)))
+    sums[name] = paid + solution.value_at(path.times, path.states, clamp=True)
+    shown = ", ".join(f"{each:.3f}" for each in sums[name][[0, 15, 30, 45]])
+    print(f"{name:16} cost up to r plus V at r = 0, 0.75, 1.5, 2.25: {shown}")
+assert np.ptp(sums["optimal"]) < 0.1
+assert sums["twice as strong"][30] > sums["optimal"][30] + 0.1
+
+# %% [markdown]
 # ## Costates and gradients
 #
 # The costates (solid) and the gradient of the value along the same path (dashed):

@@ -131,4 +131,4 @@ def command(quick: bool, names: tuple[str, ...], tol: float, out: Path) -> None:
         raise click.UsageError(f"got --problem {', '.join(unknown)}, wanted some of {', '.join(known)}")
     cases = [case for case in CASES if not names or case.entry in names]
     rows = measure(cases, quick=quick, tol=tol)
-    publish(out, "accuracy", rows, panel="problem", line="scheme", x=("h", "seconds"), y="error")
+    publish(out, "accuracy", rows)

@@ -189,4 +189,4 @@ def command(quick: bool, out: Path) -> None:
     click.echo(table(rows, COLUMNS))
     for sentence in verdicts(rows):
         click.echo(sentence)
-    publish(out, "precision", rows, panel="problem", line="scheme", x=("seconds",), y="error", across=3)
+    publish(out, "precision", rows)

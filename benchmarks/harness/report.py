@@ -16,6 +16,7 @@ from typing import Any
 
 import click
 
+from benchmarks.harness import charts
 from hjbjax.cli import run_folder
 from hjbjax.cli.command_line import Failure
 
@@ -110,65 +111,16 @@ def put(out: Path, write: Callable[[Path], None]) -> None:
         raise Failure(f"{error}; {run_folder.rescue(out, write)}", 5) from error
 
 
-def publish(out: Path, name: str, rows: Sequence[dict[str, Any]], **drawing: Any) -> None:
-    """Write the stamped rows to ``name``.json, and their picture to ``name``.png; ``drawing`` as in ``picture``."""
+def publish(out: Path, name: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Write the stamped rows to ``name``.json, and their pictures next to it if ``charts`` has some."""
     rows = stamped(rows)
 
     def write(folder: Path) -> None:
         write_json(folder / f"{name}.json", rows)
-        if drawing:
-            picture(folder / f"{name}.png", rows, **drawing)
+        charts.draw(folder, name, rows)
 
     put(out, write)
-    click.echo(f"{len(rows)} rows in {out / name}.json{', the picture beside it' if drawing else ''}")
-
-
-def picture(
-    path: Path, rows: Sequence[dict[str, Any]], *, panel: str, line: str, x: Sequence[str], y: str, across: int = 4
-) -> None:
-    """Draw logarithmic panels: one block per value of ``panel``, with ``y`` over every ``x``.
-
-    Args:
-      path: of the PNG.
-      rows: the measurements; rows without finite positive numbers are left out.
-      panel: the column that selects the block of a row.
-      line: the column that selects its line.
-      x: the columns of the horizontal axes, one panel each.
-      y: the column of the vertical axis.
-      across: blocks in a row.
-    """
-    from matplotlib.figure import Figure
-
-    from hjbjax.plotting.style import COLOURS, logarithmic, styled
-
-    rows = [row for row in rows if all(_is_number(row.get(key)) and 0 < row[key] < math.inf for key in (*x, y))]
-    if not rows:
-        return
-    panels, lines = (list(dict.fromkeys(row[key] for row in rows)) for key in (panel, line))
-    across = min(across, len(panels))
-    down = -(-len(panels) // across)
-    figure = Figure(figsize=(1.9 * across * len(x), 0.5 + 1.8 * down), layout="constrained")
-    grid = figure.subplots(down, across * len(x), squeeze=False)
-    for ax in grid.ravel()[len(panels) * len(x) :]:
-        ax.remove()
-    for place, name in enumerate(panels):
-        for side, key in enumerate(x):
-            ax = styled(grid[place // across, (place % across) * len(x) + side])
-            for colour, label in zip(COLOURS, lines, strict=False):
-                mine = [row for row in rows if (row[panel], row[line]) == (name, label)]
-                points = [[row[column] for row in mine] for column in (key, y)]
-                ax.plot(*points, marker="o", markersize=3, linewidth=1, color=colour, label=label)
-            logarithmic(ax)
-            ax.tick_params(labelsize=6, labelleft=side == 0)  # the panels of a block share their vertical axis
-            ax.set_xlabel(key, fontsize=7)
-            if side == 0:
-                ax.set_title(name, fontsize=8, loc="left")
-                ax.set_ylabel(y, fontsize=7)
-    figure.legend(
-        *grid[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=7, frameon=False
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=90)
+    click.echo(f"{len(rows)} rows in {out / name}.json{', the picture beside it' if name in charts.CHARTS else ''}")
 
 
 def without(module: str) -> str | None:

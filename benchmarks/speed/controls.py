@@ -19,7 +19,7 @@ import numpy as np
 
 import hjbjax as hjb
 from benchmarks import cases
-from benchmarks.harness.report import RESULTS, Folder, attempt, picture, put, stamped, table, write_json
+from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 from benchmarks.harness.timing import interleaved
 from hjbjax.applications.convergence import fitted_order
 from hjbjax.applications.reference import at_nodes_of, mask_of
@@ -100,13 +100,4 @@ def command(quick: bool, repeats: int | None, nodes: int | None, out: Path) -> N
     rows = attempt(lambda: by_number(nodes, counts, again), about | {"problem": "pendulum, one grid"})
     rows += attempt(lambda: by_error(sizes, again), about | {"problem": "smooth, finer grids"})
     click.echo(table(rows, COLUMNS))
-    rows = stamped(rows)
-    number, error = ([row for row in rows if row.get("part") == part] for part in ("number", "error"))
-
-    def write(folder: Path) -> None:
-        write_json(folder / "controls.json", rows)
-        picture(folder / "controls.png", number, panel="problem", line="minimum", x=("controls", "error"), y="seconds")
-        picture(folder / "controls_error.png", error, panel="problem", line="minimum", x=("error",), y="seconds")
-
-    put(out, write)
-    click.echo(f"{len(rows)} rows in {out / 'controls.json'}, pictures in {out}/controls*.png")
+    publish(out, "controls", rows)

@@ -156,4 +156,4 @@ def command(
         rows += mine
     figures = judged([row for row in rows if "nodes" in row])
     rows += thresholds.announced(figures, "growth")
-    publish(out, "growth", rows, panel="problem", line="benchmark", x=("nodes",), y="seconds")
+    publish(out, "growth", rows)

@@ -135,4 +135,4 @@ def command(quick: bool, repeats: int | None, out: Path) -> None:
         name = {"problem": f"{hidden} hidden states"}
         rows += attempt(lambda s=hidden, n=sizes: measured(s, n, again), about | name)
     click.echo(table(rows, COLUMNS))
-    publish(out, "information", rows, panel="problem", line="part", x=("error",), y="nodes")
+    publish(out, "information", rows)

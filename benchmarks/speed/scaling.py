@@ -69,4 +69,4 @@ def command(quick: bool, dimensions: tuple[int, ...], repeats: int | None, times
         click.echo(table(mine, COLUMNS) + "\n")
         rows += mine
     rows = [row | {"dimensions": f"{row['dimension']}-D"} for row in rows]
-    publish(out, "scaling", rows, panel="problem", line="dimensions", x=("nodes",), y="seconds")
+    publish(out, "scaling", rows)

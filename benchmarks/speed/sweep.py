@@ -294,4 +294,4 @@ def command(quick: bool, repeats: int | None, controls: int, few: int, out: Path
         rows += found
     figures = judged(rows)
     rows += thresholds.announced(figures, "sweep")
-    publish(out, "sweep", rows, panel="problem", line="kernel", x=("nodes",), y="node_controls_per_second")
+    publish(out, "sweep", rows)

@@ -1,7 +1,7 @@
 """Systems whose Lie brackets decide which feedback exists; all but ``OneWay`` and ``Angle`` are driftless.
 
 one way           ẋ₁ = u, ẋ₂ = x₁²                        Example 4.1: accessible but not controllable
-angle             ẋ = u, y = (cos x, sin x)               locally but not globally observable
+angle             ẋ = u, y = sin x                        Example 4.2: locally but not globally observable
 unicycle          ẋ = u₁ cos θ, ẏ = u₁ sin θ, θ̇ = u₂      u₁ drives forward, u₂ turns
 car, n trailers   as the unicycle, with θ̇_i = (v_{i−1}/d_i) sin(θ_{i−1} − θ_i), v_i = v_{i−1} cos(θ_{i−1} − θ_i)
 Pomet             ẋ₁ = u₁, ẋ₂ = x₁u₂, ẋ₃ = u₂             (6.6), stabilised by a feedback of (t, x)
@@ -44,9 +44,10 @@ class OneWay:
 
 @pytree_dataclass()
 class Angle:
-    """ẋ = u on the line with the output (cos x, sin x): observable locally but not globally, as in Example 4.2.
+    """Example 4.2, ẋ = u on the line with the output y = sin x: observable locally but not globally.
 
-    The outputs distinguish nearby states, but not two states that are 2π apart.
+    At x = π/2 the slope of the output is zero, and its derivative along the input distinguishes nearby states. Two
+    states that are 2π apart have the same outputs.
     """
 
     def drift(self, x: State, u: Control) -> State:
@@ -54,8 +55,8 @@ class Angle:
         return jnp.stack([u[0]])
 
     def output(self, x: State) -> jax.Array:
-        """(cos x, sin x)."""
-        return jnp.stack([jnp.cos(x[0]), jnp.sin(x[0])])
+        """Sin x."""
+        return jnp.stack([jnp.sin(x[0])])
 
 
 @pytree_dataclass()

@@ -193,7 +193,9 @@ def test_example_42_is_observable_locally_and_not_globally():
     system = zoo.Angle()
     f, gs = geometry.affine_fields(system.drift, 1)
     for x in np.linspace(-7, 7, 15):
-        assert geometry.observability_codistribution(f, gs, system.output, [x], 0).rank == 1
+        assert geometry.observability_codistribution(f, gs, system.output, [x], 1).rank == 1
+    ranks = [geometry.observability_codistribution(f, gs, system.output, [np.pi / 2], depth).rank for depth in (0, 1)]
+    assert ranks == [0, 1]
     # Two states 2π apart have the same outputs under every input, since the input moves both alike.
     problem = hjb.Problem(system.drift, None, hjb.Box([-1.0], [1.0]))
 

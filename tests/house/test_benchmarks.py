@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 import hjbjax as hjb
 from benchmarks import cases
 from benchmarks.__main__ import NAMES
 from benchmarks.accuracy import memory, mutants
-from benchmarks.harness import footprint, thresholds, timing
+from benchmarks.harness import charts, footprint, thresholds, timing
 from benchmarks.speed import (
     batch,
     controls,
@@ -56,6 +57,30 @@ def rows_of(benchmark, folder, *options):
 def test_every_name_leads_to_a_command(name):
     module = importlib.import_module(f"benchmarks.{NAMES[name][0]}.{name}")
     assert CliRunner().invoke(module.command, ["--help"]).exit_code == 0
+
+
+# --- pictures ---
+
+
+def test_the_recorded_pictures_are_large_and_complete():
+    for name in charts.CHARTS:
+        rows = json.loads((charts.RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+        for stem, drawing in charts.CHARTS[name](rows).items():
+            assert drawing.charts[0].lines
+            with Image.open(charts.RESULTS / f"{stem}.png") as picture:
+                assert picture.width >= 1000
+
+
+def test_the_law_is_drawn_with_the_measured_exponents(tmp_path):
+    rows = [
+        {"dimension": n, "nodes": 10.0**k, "seconds": n * 10.0 ** (k - 4), "date": "2026-01-01"}
+        for n in (1, 2) for k in (3, 4, 5)
+    ]  # fmt: skip
+    lines = charts.scaling(rows)["scaling"].charts[0].lines
+    assert [line.label for line in lines] == ["1 state: exponent 1.00", "2 states: exponent 1.00"]
+    (made,) = charts.draw(tmp_path, "scaling", rows)
+    assert made.stat().st_size > 10_000
+    assert charts.draw(tmp_path, "scaling", [{"status": "FAILED", "date": "", "dimension": 1}]) == []
 
 
 # --- timing and thresholds ---

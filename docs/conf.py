@@ -13,7 +13,7 @@ project = "hjbjax"
 author = copyright = "The hjbjax developers"
 release = version = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 exclude_patterns = ["generated/*"]  # included by pages that say more
 nitpicky = True  # a reference that leads nowhere is a warning, and `python -m docs` makes an error of it
 
@@ -21,7 +21,10 @@ myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 
 
-autodoc_typehints = "none"  # what an argument is stands in words beside its name, with shape and unit
+autodoc_typehints = "description"  # in brackets after the name; shape and unit are in the text
+autodoc_typehints_description_target = "documented_params"
+nitpick_ignore_regex = [("py:class", ".*")]  # types in signatures have no entry of their own
+copybutton_exclude = ".linenos, .gp, .go"
 autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 napoleon_numpy_docstring = False

@@ -59,7 +59,7 @@ assert abs(solution.value_at(0.0, start) - extremal.cost) < 0.01
 # time $r$ plus the value of the state at that time is the same number for all $r$, and it is larger for another
 # control:
 #
-# $$V(x_0, 0) = \inf_u \Big[\int_0^r L(x, u)\,dt + V(x(r), r)\Big].$$
+# $$V(x_0, 0) = \inf_u [\int_0^r L(x, u)\,dt + V(x(r), r)].$$
 
 # %%
 sums = {}

@@ -25,6 +25,7 @@ from hjbjax._version import __version__
 from hjbjax.cli import run_folder
 from hjbjax.cli.command_line import text_of
 from hjbjax.feedback.path import Path as Trajectory
+from hjbjax.plotting.slices import feedback
 from hjbjax.problem.labels import COST
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution import placement
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 PAGE = "index.html"
 NODES = 20_000  # maximum per problem: tenths of a second once compiled; with 62 x 63 the pendulum is 3 % off
 DPI = 72  # 9.6 inches give 690 pixels, the width of a card
+NEARLY = 0.99  # share of the nodes
 QUALITY = 85  # of WebP: 12 kB per picture; 60 gives 8 kB but frayed edges of shaded fields
 
 
@@ -115,7 +117,8 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
         # put warnings on the card instead of the terminal, which shows one line per problem
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always", SolveWarning)
-            solution = hjb.solve(problem, grid, throw=False, **(options or {}))
+            scheme = {"scheme": hjb.SemiLagrangian()} if entry.kinked else {}
+            solution = hjb.solve(problem, grid, throw=False, **(scheme | (options or {})))
     except (SolveError, ValueError, jax.errors.JaxRuntimeError) as error:
         return Card(entry.name, entry.summary, type(error).__name__, (("refused", " ".join(str(error).split())),), ())
     if solution.status == Status.INTERRUPTED:
@@ -148,9 +151,18 @@ def _figures(problem: Problem, solution: Solution, entry: Entry) -> tuple[list[t
         figure = run_folder.figure_of(plotting.maps.closed_loop_size(solution.grid))
         plotting.closed_loop(solution, path, fixed=fixed, target=problem.target, figure=figure)
         drawn.append(("the closed loop" if solution.grid.ndim == 1 else "the value, and the closed loop on it", figure))
-    if solution.policy.shape[-1]:
+    if solution.policy.shape[-1] and not _is_constant(solution, fixed):
         drawn.append(("the feedback", run_folder.plot_policies(solution, fixed, jumps)))
     return drawn, path
+
+
+def _is_constant(solution: Solution, fixed: dict[int, float]) -> bool:
+    """True if the feedback of one input is the same at nearly all nodes of a cut: a picture of one colour."""
+    if not fixed or solution.policy.shape[-1] != 1:
+        return False
+    section, _ = feedback(solution, 0, fixed, None)
+    known = section.values.compressed()
+    return bool(known.size) and float(np.mean(np.isclose(known, np.median(known)))) > NEARLY
 
 
 def webp(figure: Figure, dpi: int = DPI) -> bytes:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hjbjax.plotting.scales import is_angle, set_ticks
+from hjbjax.plotting.scales import is_angle, set_ticks, time_label
 from hjbjax.plotting.shading import Look, draw
 from hjbjax.plotting.slices import section_of
 from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend
@@ -86,7 +86,7 @@ def estimates(
             label = "dy/dt" if rates.shape[1] == 1 else f"dy{j + 1}/dt"
             style: dict[str, Any] = {"color": COLOURS[(len(shown) + j) % len(COLOURS)], "markersize": 2, "alpha": 0.5}
             artists += ax.plot((times[:-1] + times[1:]) / 2, rates[:, j], ".", zorder=0, label=label, **style)
-    label_axes(ax, "t", names[shown[0]] if len(shown) == 1 else "state")
+    label_axes(ax, time_label(grid), names[shown[0]] if len(shown) == 1 else "state")
     set_ticks(ax.xaxis, False)
     set_ticks(ax.yaxis, len(shown) == 1 and grid is not None and is_angle(grid, shown[0]))
     return Picture([*artists, legend(ax)], ax)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hjbjax.plotting.scales import set_ticks
+from hjbjax.plotting.scales import set_ticks, time_label
 from hjbjax.plotting.shading import is_level, limits_around
 from hjbjax.plotting.slices import described, span_of
 from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes, legend
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hjbjax.feedback.path import Path
     from hjbjax.solution.solution import Solution
 
-JUMPS = 60  # jumps of one control back and forth; more would fill a plot 10 cm wide
+JUMPS = 14  # jumps of one control back and forth; of more the mean says more
 WINDOW = 0.04  # fraction of the duration, the width of the running mean for such a control
 
 
@@ -65,7 +65,7 @@ def costates(
             # broad and pale, so that λ remains visible where the two agree
             style: dict[str, Any] = {"color": colours[i], "linewidth": 3.6, "alpha": 0.4, "linestyle": "--"}
             artists += ax.plot(times, slopes[:, i], label=f"DV, {names[i]}", **style)
-    label_axes(ax, "t", "costate")
+    label_axes(ax, time_label(None if solution is None else solution.grid), "costate")
     set_ticks(ax.xaxis, False)
     set_ticks(ax.yaxis, False)
     return Picture([*artists, legend(ax)], ax)
@@ -115,7 +115,7 @@ def controls(
             mean = _running_mean(times, inputs[:, i], width)
             look = {"color": look["color"], "linewidth": 1.4}
             means += ax.plot(times, mean, label=f"{name}, mean over {width:.2g}", **look)
-    label_axes(ax, "t", names[0] if count == 1 else "control")
+    label_axes(ax, time_label(None if solution is None else solution.grid), names[0] if count == 1 else "control")
     set_ticks(ax.xaxis, False)
     set_ticks(ax.yaxis, False)
     span = max((span_of(solution, i) for i in range(count)), default=0.0) if solution is not None else 0.0

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
-from hjbjax.plotting.scales import angle_step, angle_text, box_sides, is_angle, set_ticks
+from hjbjax.plotting.scales import angle_step, angle_text, box_sides, is_angle, place_text, set_ticks
 from hjbjax.plotting.shading import frame, outlined
 from hjbjax.plotting.slices import (
     Cuts,
@@ -183,8 +183,9 @@ def turning_surface(
             scene[f"{name}axis"] |= {"tickvals": ticks, "ticktext": [angle_text(tick) for tick in ticks]}
     sides = dict(zip("xyz", box_sides(field.grid, free), strict=True))
     scene |= {"aspectmode": "manual", "aspectratio": sides}
-    margin = {"l": 0, "r": 0, "b": 0, "t": 40 * bool(field.caption)}
-    return Scene(graph_objects.Figure(data=[mesh], layout={"scene": scene, "title": field.caption, "margin": margin}))
+    caption = _caption(field, cuts)
+    margin = {"l": 0, "r": 0, "b": 0, "t": 40 * bool(caption)}
+    return Scene(graph_objects.Figure(data=[mesh], layout={"scene": scene, "title": caption, "margin": margin}))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,6 +268,13 @@ def _cube(field: Field, fixed: Mapping[str, float]) -> tuple[list[int], np.ndarr
     return free, *thinned(closed, [closed_axis(grid, axis) for axis in free])
 
 
+def _caption(field: Field, fixed: Mapping[str, float]) -> str:
+    """The time of a field, and the coordinates at which it is cut."""
+    grid = field.grid
+    places = [f"{name} = {place_text(grid, grid.names.index(name), place)}" for name, place in fixed.items()]
+    return ", ".join([field.caption] * bool(field.caption) + places)
+
+
 def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, label: str | None) -> Picture:
     """Draw the surface V = 0 over the three free axes."""
     from matplotlib.ticker import MaxNLocator
@@ -290,8 +298,8 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
         getattr(ax, f"set_{text}label")(grid.labels[number], labelpad=8)
     # smaller than its frame, otherwise the label on the right would be cut off
     ax.set_box_aspect(box_sides(grid, free), zoom=0.86)
-    if field.caption:
-        ax.set_title(field.caption, loc="right", fontsize=9)
+    if caption := _caption(field, fixed):
+        ax.set_title(caption, loc="right", fontsize=9)
     if label and artists:
         ax.plot([], [], [], color=color, linewidth=4, alpha=OPACITY, label=label)
         ax.legend(frameon=False, fontsize=8)

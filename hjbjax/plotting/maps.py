@@ -10,7 +10,7 @@ import numpy as np
 
 from hjbjax.plotting.histories import controls
 from hjbjax.plotting.modes import by_mode
-from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks
+from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks, time_label
 from hjbjax.plotting.shading import Look, draw, fill_missing, frame, is_level, jumps, stopped
 from hjbjax.plotting.slices import (
     Cuts,
@@ -249,7 +249,7 @@ def trajectory(
         artists: list[Artist] = [
             ax.plot(times, states[:, i], color=next(colours), label=names[i])[0] for i in range(count)
         ]
-        label_axes(ax, "t", names[0] if count == 1 else "state")
+        label_axes(ax, time_label(grid), names[0] if count == 1 else "state")
         set_ticks(ax.xaxis, False)
         set_ticks(ax.yaxis, count == 1 and grid is not None and is_angle(grid, 0))
         return Picture(artists if count == 1 else [*artists, legend(ax)], ax)

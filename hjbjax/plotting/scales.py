@@ -69,6 +69,17 @@ def place_text(grid: Grid, axis: int, place: float) -> str:
     return (angle_text(place) if simple else f"{place:.4g}") + unit
 
 
+def time_label(grid: Grid | None) -> str:
+    """The label of a time axis, with seconds if a state is measured per second.
+
+    Example:
+      >>> time_label(Grid([0.0], [1.0], (4,), units=("m/s",))), time_label(Grid([0.0], [1.0], (4,)))
+      ('t [s]', 't')
+    """
+    per_second = grid is not None and any("/s" in unit for unit in grid.units)
+    return "t [s]" if per_second else "t"
+
+
 def are_positions(grid: Grid, axes: Sequence[int]) -> bool:
     """True for two axes with the same unit of length, on which a circle must look round."""
     units = {grid.units[axis] for axis in axes}

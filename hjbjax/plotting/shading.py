@@ -13,7 +13,7 @@ import numpy as np
 
 from hjbjax.plotting.scales import number_text, scale_axes
 from hjbjax.plotting.slices import Region, Section
-from hjbjax.plotting.style import COLOURS, label_axes, legend
+from hjbjax.plotting.style import COLOURS, GREY, label_axes, legend
 from hjbjax.solution.free_boundary import points_of, segments_of
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
 FLAT = 1e-4  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
+OBSTACLE = "obstacle"  # the label of a set that is drawn solid
 HATCH, DOTS, STROKE = "////", "..", "#909090"
 EXTREME = 1e-6  # fraction of the range: a control closer to its end counts as being there
 JUMPING = 0.9  # fraction of nodes at an end of the range, or at zero, that identifies a feedback that jumps
@@ -165,12 +166,23 @@ def hatched(ax: Axes, coordinates: tuple[np.ndarray, ...], level: np.ndarray, la
 
 def outlined(ax: Axes, region: Region, *, inside: bool = True) -> list[Artist]:
     """Outline a set, and hatch it if ``inside``; draws nothing if the set is not in the picture."""
+    from matplotlib.patches import Rectangle
+
     if not region.visible:
         return []
     artists: list[Artist] = []
-    if inside:
+    new = region.label not in ax.get_legend_handles_labels()[1]
+    if region.label == OBSTACLE:  # solid, and not hatched or empty like a target
+        area: dict[str, Any] = {"facecolor": GREY, "edgecolor": "black", "linewidth": 0.6}
+        if region.level.min() < 0:
+            top = [0.0, float(-region.level.min()) + 1.0]
+            artists.append(ax.contourf(*region.coordinates, -region.level.T, levels=top, colors=[GREY], zorder=2))
+        if new:
+            corner = (float(region.coordinates[0][0]), float(region.coordinates[1][0]))
+            ax.add_patch(Rectangle(corner, 0, 0, label=region.label, **area))
+    elif inside:
         artists += hatched(ax, region.coordinates, -region.level, region.label)
-    elif region.label not in ax.get_legend_handles_labels()[1]:
+    elif new:
         ax.plot([], [], color="black", linewidth=1.0, label=region.label)
     if region.level.max() > 0:  # otherwise the set fills the picture, and matplotlib would warn about an empty contour
         artists.append(

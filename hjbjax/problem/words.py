@@ -34,12 +34,12 @@ MAXIMISE = "to maximise, write reward= instead of cost="
 BOUNDS = "wanted controls=hjb.Box(lo, hi)"
 BOX = "the range of the states belongs to the grid: hjb.solve(problem, hjb.Grid(lo, hi, shape))"
 LIMITS = (
-    "the ends of the box are limits with hjb.Grid(..., edges='constrained'); another forbidden set is a target with\n"
-    "exit_cost=jnp.inf; bounds of the controls may depend on the state: controls=lambda x: hjb.Box(lo(x), hi(x))"
+    "the ends of the box are limits with hjb.Grid(..., edges='constrained'); another forbidden set is a target with a\n"
+    "large exit_cost; bounds of controls may depend on the state: controls=lambda x: hjb.Box(lo(x), hi(x))"
 )
 OBSTACLE = (
-    "an obstacle is a target with exit_cost=jnp.inf; for a target and an obstacle together make exit_cost a function,\n"
-    "0 on one and jnp.inf on the other, or use hjb.reach_avoid(drift, controls, target, obstacle)"
+    "an obstacle is a target with a large exit_cost, such as 1e3; for a target and an obstacle join both by\n"
+    "jnp.minimum and make exit_cost a function. Reachable sets: hjb.reach_avoid(drift, controls, target, obstacle)"
 )
 HORIZON = "a finite horizon belongs to hjb.march(problem, grid, horizon), with Problem(terminal_cost=...)"
 START = "V is computed for all states; follow a path with hjb.simulate(problem, solution, x0, duration)"

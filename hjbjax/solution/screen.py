@@ -20,7 +20,8 @@ from hjbjax.problem.streams import encodable, plain
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.status import Status
 
-WIDTH = 100  # columns of the printed summary
+WIDTH = 80  # columns of the printed summary, as many as a page of the documentation shows
+LABEL = 19  # columns of the labels
 THUMBNAIL = 160  # pixels, and the largest number of nodes per axis
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
@@ -65,16 +66,15 @@ class _Answer(Protocol):
 
 
 def show(solution: _Answer) -> str:
-    """The printed summary of a solution: at most 16 lines; unknown entries are left out."""
+    """The printed summary of a solution: one line per entry, or two; unknown entries are left out."""
     stats, grid = solution.stats, solution.grid
-    axes = " x ".join(map(functools.partial(_axis_text, grid), range(grid.ndim)))
     last = "" if solution.residual is None else f", last residual {solution.residual:.3g}"
     reached = 1.0 if solution.reached is None else float(np.mean(np.asarray(solution.reached)))
     compiling = f", and {number(stats['compile_seconds'])} to check and compile" if "compile_seconds" in stats else ""
     dtype = number(stats.get("dtype") or str(np.asarray(solution.value).dtype))
     # each statistic is checked separately: any may be missing, and in a file any may have the wrong type
     rows = {
-        "grid": f"{axes}: {' x '.join(map(str, grid.shape))} = {grid.size:,} nodes",
+        "grid": _grid_text(grid),
         "times": "" if solution.times is None else str(np.size(solution.times)),
         "method": ", ".join(number(stats[name]) for name in ("method", "scheme") if name in stats),
         "steps": f"{int(solution.steps)}{last}",
@@ -94,7 +94,22 @@ def show(solution: _Answer) -> str:
     said = plain(f"{solution.status.name}: {solution.message or solution.status.message}")
     head = textwrap.wrap(said, WIDTH)
     lines = head if len(head) < 4 else [*head[:2], one_line(" ".join(head[2:]))]
-    return encodable("\n".join(lines + [f"  {name:15}  {one_line(text)}" for name, text in rows.items() if text]))
+    return encodable("\n".join(lines + [_row(name, text) for name, text in rows.items() if text]))
+
+
+def _row(name: str, text: str) -> str:
+    """A label and its text, on one line or two."""
+    width, text = WIDTH - LABEL, plain(text)
+    first, *rest = [text] if len(text) <= width else textwrap.wrap(text, width)
+    label = f"  {name}".ljust(LABEL)
+    return f"{label}{first}" + (f"\n{' ' * LABEL}{one_line(' '.join(rest), width)}" if rest else "")
+
+
+def _grid_text(grid: Grid) -> str:
+    """The axes with their numbers of nodes; only the numbers if the names would not fit on two lines."""
+    axes = " x ".join(map(functools.partial(_axis_text, grid), range(grid.ndim)))
+    counts = f"{' x '.join(map(str, grid.shape))} = {grid.size:,} nodes"
+    return f"{axes}: {counts}" if len(axes) + len(counts) + 2 <= 2 * (WIDTH - LABEL) - 20 else counts
 
 
 def _devices(stats: dict[str, Any]) -> str:

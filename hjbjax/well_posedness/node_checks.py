@@ -358,12 +358,15 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
     ingredient = getattr(problem, name)
     # a constant is wrong everywhere, so no node is named
     if not callable(ingredient):
-        raise ValueError(f"Problem.{problem.labels.word(name)}: got {np.asarray(ingredient)}, wanted finite numbers")
+        cure = "; a number larger than any V forbids a set, such as 1e3" if name == "exit_cost" else ""
+        word = problem.labels.word(name)
+        raise ValueError(f"Problem.{word}: got {np.asarray(ingredient)}, wanted finite numbers{cure}")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
     raise ValueError(
         f"{call(problem, name)} is NaN or infinite at {where}.\n"
         "Keep the singularity out of the box (lo, hi) or between nodes (shape), or define the function there:\n"
         "jnp.where(bad, finite, f(jnp.where(bad, safe_x, x)))"
+        + ("\nA number larger than any V forbids a set, such as 1e3" if name == "exit_cost" else "")
     )
 
 

@@ -78,6 +78,7 @@ _ENTRIES = (
         # from rest at 1 the least time is 2, half the duration of the picture
         start=(1.0, 0.0),
         duration=4.0,
+        kinked=True,
     ),
     Entry(
         "double-integrator-lq",
@@ -126,7 +127,14 @@ _ENTRIES = (
     ),
     # the least time from this point is its norm, which is less than 1
     Entry("eikonal", "the shortest way to the origin", eikonal, eikonal_exact, start=(0.8, 0.5), duration=2.0),
-    Entry("dubins", "drive a car that cannot turn on the spot to a disc", dubins, start=(-1.5, 0.5, 0.0), duration=8.0),
+    Entry(
+        "dubins",
+        "drive a car that cannot turn on the spot to a disc",
+        dubins,
+        start=(-1.5, 0.5, 0.0),
+        duration=8.0,
+        kinked=True,
+    ),
     # starts on the limit cycle, whose amplitude is 2
     Entry("van-der-pol", "quieten a Van der Pol oscillator", van_der_pol, start=(2.0, 0.0), duration=10.0),
     Entry("bang-bang", "hold a point near zero with a bounded speed", bang_bang, bang_bang_exact, start=(1.5,)),

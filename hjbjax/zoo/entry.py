@@ -25,6 +25,7 @@ class Entry:
       finish: ``finish(**parameters) -> (problem, feedback)`` with the keywords of ``exact``, for a problem whose target
         prescribes the cost of a final phase. It returns the problem of the final phase, which ends where the full
         problem ends, and its exact feedback. ``None`` if there is no final phase.
+      kinked: True if optimal paths follow kinks of the value, where the gallery uses ``SemiLagrangian()``.
 
     Example:
       >>> from hjbjax import zoo
@@ -41,6 +42,7 @@ class Entry:
     start: tuple[float, ...] = ()
     duration: float = 5.0
     finish: Callable[..., tuple[Problem, Feedback]] | None = None
+    kinked: bool = False
 
     @property
     def parameters(self) -> dict[str, Any]:  # numbers, tuples of numbers, booleans or None

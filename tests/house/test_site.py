@@ -78,6 +78,13 @@ def test_a_fraction_of_two_digits_is_one(tex, top, bottom):
     assert f"<mn>{top}</mn><mn>{bottom}</mn></mfrac>" in shown
 
 
+def test_a_subscript_stands_next_to_an_accented_letter():
+    """docutils puts it below, in one element with the accent above."""
+    shown = re.sub(r"\s", "", mathml.converted(r"\dot x_1 = \sum_i^n x"))
+    assert '<msub><moveraccent="true"><mi>x</mi><mostretchy="false">˙</mo></mover><mn>1</mn></msub>' in shown
+    assert "<munderover>" in shown  # the limits of a sum stay where they are
+
+
 def test_no_page_of_a_notebook_shows_the_text_of_an_object():
     for page in (DOCS / "notebooks").glob("*.md"):
         assert not re.search(r"<IPython|object at 0x", page.read_text(encoding="utf-8")), page.name
@@ -185,6 +192,8 @@ def test_a_browser_has_nothing_to_complain_of(site, page, tmp_path):
     said, shown = complaints((site / page).as_uri(), tmp_path)
     assert not said
     assert "</article>" in shown
+    if page == "getting_started.html":
+        assert shown.count("copybtn") >= 5  # one button per block, made by its script
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from pictures import covers
 from pictures import pictures as plotting
@@ -46,6 +47,12 @@ def test_the_projection_of_a_ball_has_its_radius():
     np.testing.assert_allclose(radii(curve), 0.6, atol=0.02)
     outside = plotting.zero_level_set(solution(-ball(0.6)), project=[2], fill=False, inside="above")[0]
     np.testing.assert_allclose(radii(outside), 0.6, atol=0.02)
+
+
+def test_a_surface_over_three_of_four_axes_names_the_cut():
+    grid = Grid([-1.0] * 4, [1.0] * 4, (5,) * 4, names=("x", "y", "z", "speed"), units=("", "", "", "m/s"))
+    picture = plotting.zero_level_set(solution(ball(0.6, grid), grid), fixed={"speed": 0.25})
+    assert picture.ax.get_title(loc="right") == "speed = 0.25 m/s"
 
 
 def test_three_axes_make_a_closed_surface():
@@ -142,6 +149,9 @@ def test_the_sets_of_a_problem_of_reachability_are_outlined():
     about.problem = problem
     picture = plotting.zero_level_set(about)
     assert [text.get_text() for text in picture.ax.get_legend().get_texts()] == ["target", "obstacle"]
+    target, obstacle = picture.ax.get_legend().legend_handles
+    assert to_hex(obstacle.get_facecolor()) == hjb.plotting.GREY  # a solid area, while a target is an outline
+    assert not hasattr(target, "get_facecolor")
     outlines = [each for each in picture if each.get_zorder() == 2.5]
     np.testing.assert_allclose(radii(outlines[0]), 0.3, atol=1e-3)
     np.testing.assert_allclose(outlines[1].get_paths()[0].vertices[:, 1], 0.8, atol=1e-9)

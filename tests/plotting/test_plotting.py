@@ -556,6 +556,14 @@ def test_without_axes_every_picture_has_a_new_figure():
     pyplot.close("all")
 
 
+def test_a_time_is_in_seconds_if_a_state_is_per_second():
+    grid = Grid([-1.0, -2.0], [1.0, 2.0], (3, 3), units=("m", "m/s"))
+    path = path_of([[0.5, 1.0], [0.0, 0.0]])
+    assert plotting.trajectory(path, axes=None, grid=grid).ax.get_xlabel() == "t [s]"
+    assert plotting.trajectory(path, axes=None).ax.get_xlabel() == "t"
+    assert plotting.controls(path, solution=made(grid, lambda x: x[..., 0])).ax.get_xlabel() == "t [s]"
+
+
 def test_a_picture_saves_itself(tmp_path):
     picture = plotting.value(line())
     picture.save(tmp_path / "value.png")

@@ -104,7 +104,7 @@ def test_of_long_messages_only_the_beginning_is_wrapped(tmp_path, size, monkeypa
         loaded = hjb.load(path)
         assert loaded.message == message
         assert len(str(loaded)) < 2000
-    assert len(wrapped) == 3
+    assert len(wrapped) <= 6  # the message and the method, three times
     assert max(wrapped) <= streams.LONGEST + len(" ...")
 
 

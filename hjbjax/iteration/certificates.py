@@ -122,13 +122,13 @@ def error_bound(
     if kind is Certificate.MULTIPLICATIVE:
         assert least_cost is not None
         return _multiplicative(iterate, least_cost, residual)
-    return measured(residual, moved)
+    return measured(residual, jnp.maximum(residual, moved))
 
 
-def measured(residual: Scalar, moved: Number) -> ErrorBound:
-    """The error without a bound, from the residual and the size of the last correction."""
+def measured(residual: Scalar, error: Scalar) -> ErrorBound:
+    """The measures of a value without a bound: its residual and the estimate of its error."""
     zero = jnp.zeros_like(residual)
-    return ErrorBound(zero, zero, zero, jnp.maximum(residual, moved), residual)
+    return ErrorBound(zero, zero, zero, error, residual)
 
 
 def of_relaxation(kind: Certificate, on: Discretisation, value: Field) -> tuple[Field, ErrorBound]:

@@ -61,6 +61,8 @@ class Task(GridTask):
         program solves both. None: always the scheme itself. Only without noise.
       floor: a lower bound on all values, cost units, for a high-order scheme; None if there is none.
       shift: an addition to the discount in high-order corrections, per unit time; None for zero.
+      weights: the weights of the largest and of the mean change in the norm of high-order steps and residuals, (2,),
+        each ``tol`` over the tolerance for it; None for the chain.
       mesh: the devices over which the nodes are divided during the iteration; None for one device.
     """
 
@@ -78,6 +80,7 @@ class Task(GridTask):
     first_order: Any = None
     floor: Any = None
     shift: Any = None
+    weights: Any = None
     mesh: Mesh | None = None
 
     @property
@@ -97,7 +100,7 @@ class Task(GridTask):
     @property
     def of_chain(self) -> "Task":
         """The task of the chain, for a separate program."""
-        return dataclasses.replace(self, on=self.on.chain, first_order=None)
+        return dataclasses.replace(self, on=self.on.chain, first_order=None, weights=None)
 
     @property
     def lost(self) -> jax.Array | None:
@@ -164,6 +167,15 @@ class Task(GridTask):
     def residual(self, equation: PolicyEquation) -> Scalar:
         """The largest |source| at the counted nodes, in cost units."""
         return self.layout.largest(jnp.where(self.counting, jnp.abs(equation.source), 0))
+
+    def norm(self, change: Field) -> Scalar:
+        """The norm of a change of V, cost units: its largest size, or a weighted one of high-order iterations."""
+        size = jnp.abs(change)
+        largest = self.layout.largest(size)
+        if self.weights is None:
+            return largest
+        mean = self.layout.total(size) / math.prod(self.layout.whole)
+        return jnp.maximum(self.weights[0] * largest, self.weights[1] * mean)
 
     def start(self) -> Field:
         """The value without a guess: zero, or without a discount ψ (above all fixed points) or g (below them)."""
@@ -247,7 +259,7 @@ def _advance(task: Task, state: State, chunk: Scalar) -> State:
     value = task.impose(state.value + delta)
     # a node that does not count may change indefinitely
     change = jnp.where(task.counting, value - state.value, 0)
-    moved = task.layout.largest(jnp.abs(change))
+    moved = task.norm(change)
     if task.certificate is Certificate.OPEN and not task.method.relaxes:
         moved = moved * methods.shift_factor(_shift(task, state), task.problem.discount)
     moved = jnp.where(first, jnp.inf, moved)  # the guess was not reached by a step, so its distance cannot be estimated
@@ -388,9 +400,12 @@ def _evaluate(
     iterate = Iterate(task.layout, value, policy, left, task.obstacles, task.counting)
     known = {"discount": problem.discount, "least_cost": task.least_cost, "moved": moved}
     bound = certificates.error_bound(task.certificate, iterate, **known)
-    if task.first_order is not None:  # the chain's certificate does not apply to another scheme
-        measured = certificates.measured(bound.residual, moved)
-        bound = jax.tree.map(functools.partial(jnp.where, task.first_order), bound, measured)
+    if task.weights is not None:
+        residual = task.norm(jnp.where(task.counting, left.source, 0))
+        measured = certificates.measured(bound.residual, jnp.maximum(residual, moved))
+        first_order = False if task.first_order is None else task.first_order
+        # the chain's certificate does not apply to another scheme
+        bound = jax.tree.map(functools.partial(jnp.where, first_order), bound, measured)
     if task.has_lost:
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
         bound = dataclasses.replace(bound, error=jnp.where(leaks, jnp.inf, bound.error))

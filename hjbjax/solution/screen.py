@@ -176,16 +176,17 @@ def _share(solution: _Answer, mask: Any) -> str:
 
 def _error(solution: _Answer) -> str:
     """The certified error and its certificate, or the reason why there is none, and the error of the monotone value."""
-    error, tol = solution.error, solution.stats.get("tol")
+    error, stats = solution.error, solution.stats
+    tol = stats.get("tol")
     if error is None and solution.monotone_error is not None and tol is not None:
-        said = f"residual at most {number(tol)} at high order"
+        said = f"residual at most {number(stats.get('high_order_tol', tol))} at high order"
         # a bound above the range of V is useless
         finite = np.asarray(solution.value)[np.isfinite(np.asarray(solution.value))]
         useful = finite.size and solution.monotone_error < np.ptp(finite)
         return f"{said}; of the monotone start at most {number(solution.monotone_error)}" if useful else said
     what = "no certificate" if error is None else f"at most {error:.3g}"
     asked = "" if error is None or tol is None else f" (tol {number(tol)})"
-    why = solution.stats.get("certificate")
+    why = stats.get("certificate")
     return what + asked + (f": {number(why)}" if why else "")
 
 

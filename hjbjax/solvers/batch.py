@@ -49,12 +49,12 @@ from hjbjax.solvers import host_loop, memory, vanishing_discounts
 from hjbjax.solvers.box_error import with_box_error
 from hjbjax.solvers.coarser_answer import coarser_answer
 from hjbjax.solvers.host_solve import Choices, solve_on_host
-from hjbjax.solvers.order import raised
 from hjbjax.solvers.result import finish, solution_at_start, with_grid_error, with_last_phase
-from hjbjax.solvers.second_order import better_of
+from hjbjax.solvers.second_order import better_of, raise_order
 from hjbjax.solvers.semi_lagrangian import finish_replacement, replace_chain
 from hjbjax.solvers.settle import Settled, may_go_on, settle
 from hjbjax.solvers.setup import (
+    TOL,
     Assumptions,
     check_on_one_state,
     choose,
@@ -79,7 +79,7 @@ def solve_batch(
     *,
     method: Method | None = None,
     scheme: Scheme | None = None,
-    tol: float = 1e-3,
+    tol: float | None = None,
     dtype: DType | None = None,
     max_steps: int | None = None,
     time_limit: float | None = None,
@@ -135,6 +135,7 @@ def solve_batch(
     opened = checkpoints.open_checkpoint(
         checkpoint, lanes, grid, resume=resume, caller="solve_batch", method=method, scheme=scheme, tol=tol, dtype=kind
     )
+    free_tol, tol = tol is None, TOL if tol is None else tol
     with (
         noting_interrupts(clock),
         host_loop.announce(clock),
@@ -146,7 +147,7 @@ def solve_batch(
             # without nesting, because the host would drive the levels of each lane
             chosen = choose(first, grid, traced=False, method=method, divided=mesh is not None).inner
             on = Discretisation(first, grid, scheme or Upwind(subcell=True), kind)
-            choices = Choices(scheme=scheme is None, method=method is None, levels=False)
+            choices = Choices(scheme is None, method is None, levels=False, tol=free_tol)
             with _naming(members[0]):
                 check_on_one_state(first, grid, on.scheme)
             needed = memory.require(first, grid, chosen, kind, max_memory)
@@ -330,16 +331,16 @@ def _solve_chains(
         for i, each in enumerate(settled)
         if not asked[i].scheme.monotone and each.code not in CUT and (each.code is Status.CONVERGED or not sharpen)
     ]
-    sharp_tasks = [raised(settled[i].task, settled[i].assumptions, asked[i].scheme) for i in further]
+    sharp = [raise_order(settled[i], asked[i].scheme, clock, to_grid_error=choices.to_grid_error) for i in further]
     guesses, further_names = [settled[i].state.value for i in further], [names[i] for i in further]
-    better = _iterate([task for task, _ in sharp_tasks], guesses, further_names, clock, over)
-    for i, (task, assumptions), end in zip(further, sharp_tasks, better, strict=True):
-        sharp = Settled(task, assumptions, settled[i].reached, *end, settled[i])
-        settled[i] = better_of(settled[i], sharp, clock, sharpen=sharpen)
+    better = _iterate([each.task for each in sharp], guesses, further_names, clock, over)
+    for i, each, (state, code, residuals) in zip(further, sharp, better, strict=True):
+        each = each._replace(state=state, code=code, residuals=residuals)
+        settled[i] = better_of(settled[i], each, clock, sharpen=sharpen)
     solutions = [finish(each, on.grid, cut=clock.over() is not None) for each, on in zip(settled, asked, strict=True)]
     for i, each in enumerate(settled):
         if sharpen and asked[i].scheme.subcell and solutions[i].status is Status.CONVERGED:
-            solutions[i] = with_grid_error(solutions[i], each, coarser_answer(each, clock))
+            solutions[i] = with_grid_error(solutions[i], each, each.coarser or coarser_answer(each, clock))
         if solutions[i].status is Status.CONVERGED:
             solutions[i] = with_box_error(solutions[i], each, clock)
     about = {"seconds": clock.elapsed() - began, "lanes": len(lanes), "tol": tol}

@@ -1,7 +1,7 @@
 """Coarser grids: their tasks, and the guess that their solutions give for the finest grid."""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import Clock
+from hjbjax.solution.status import Status
 from hjbjax.solvers import nested_grids
 from hjbjax.solvers.order import at_order, sharpened, staged
 from hjbjax.solvers.setup import assumptions_of, prepared, stores_links
@@ -20,10 +21,20 @@ from hjbjax.solvers.stationary_run import iterate
 from hjbjax.solvers.vanishing_discounts import warm
 
 
+class CoarserAnswer(NamedTuple):
+    """The solution on a coarser grid, infinite at unreachable nodes, or the reason why there is none."""
+
+    grid: Grid | None
+    value: np.ndarray | None = None
+    reason: str = ""
+
+
 def first_guess(
     task: Task, scheme: Scheme, method: Method, guess: Nodes | None, clock: Clock, *, asked_again: bool
-) -> tuple[Nodes | None, list[tuple[int, ...]]]:
+) -> tuple[Nodes | None, list[tuple[int, ...]], CoarserAnswer | None]:
     """The guess for the finest grid, from the user or from coarser grids, and the shapes of those grids.
+
+    The last result is the answer on the next coarser grid, with ``asked_again``; None if it was not solved.
 
     If the clock stops the solve meanwhile, the guess is the value so far, on the finest grid; None if there is none.
 
@@ -38,20 +49,32 @@ def first_guess(
     """
     # an undiscounted tube has many fixed points; from its constraint the iteration finds the right one
     if guess is not None or (task.constrained and not np.asarray(task.problem.discount) > 0):
-        return guess, []
+        return guess, [], None
     value: Nodes | None = None
     # with noise, or without a certificate, the schemes have programs of their own
     asked_again &= scheme.monotone or staged(task, scheme) is not task
     coarser = levels(task, method, clock, asked_again=asked_again)
     if coarser:
         coarser[-1] = staged(coarser[-1], scheme)  # the one that is asked again
-    grids = [*(level.grid for level in coarser), task.grid]
+    grids, answer = [*(level.grid for level in coarser), task.grid], None
     for level, finer in zip(coarser, grids[1:], strict=True):
-        state, _, _ = iterate(level, warm(level, value, clock), clock)
+        state, code, _ = iterate(level, warm(level, value, clock), clock)
         if clock.over() is not None:
-            return nested_grids.prolong(fill_unreachable(level, state), level.grid, task.grid), []
+            return nested_grids.prolong(fill_unreachable(level, state), level.grid, task.grid), [], None
         value = nested_grids.prolong(fill_unreachable(level, state), level.grid, finer)
-    return value, [grid.shape for grid in grids[:-1]]
+        if asked_again and code is Status.CONVERGED:
+            answer = answer_of(level, state)
+    return value, [grid.shape for grid in grids[:-1]], answer
+
+
+def answer_of(level: Task, state: State) -> CoarserAnswer:
+    """The answer of a converged iteration on a coarser grid."""
+    return CoarserAnswer(level.grid, values_of(level, state))
+
+
+def values_of(task: Task, state: State) -> np.ndarray:
+    """The value, infinite at unreachable nodes, (*grid)."""
+    return np.where(np.asarray(task.counted), np.asarray(state.value), np.inf)
 
 
 def fill_unreachable(task: Task, state: State) -> np.ndarray:

@@ -24,7 +24,7 @@ from hjbjax.solvers.result import finish, solution_at_start, with_grid_error
 from hjbjax.solvers.second_order import better_of, second_order
 from hjbjax.solvers.semi_lagrangian import Followed
 from hjbjax.solvers.settle import Settled, settle
-from hjbjax.solvers.setup import COARSEST, choose_scheme, prepare_on_host, warn_unreached
+from hjbjax.solvers.setup import choose_scheme, prepare_on_host, warn_unreached
 from hjbjax.well_posedness import admissibility, node_checks
 
 
@@ -36,16 +36,23 @@ class Choices:
       scheme: the scheme.
       method: the method.
       levels: coarser grids.
+      tol: the tolerance of the second-order solution.
     """
 
     scheme: bool
     method: bool
     levels: bool
+    tol: bool = False
 
     @property
     def both(self) -> bool:
         """True if scheme and method may be replaced together."""
         return self.scheme and self.method
+
+    @property
+    def to_grid_error(self) -> bool:
+        """True if a second-order solution may stop at a fraction of the estimated error of the grid."""
+        return self.scheme and self.tol
 
 
 def solve_on_host(
@@ -70,7 +77,7 @@ def solve_on_host(
     solution = finish(settled, on.grid)
     # value iteration and tubes, whose targets consist of nodes, have no estimate
     if choices.scheme and settled.task.scheme.subcell and solution.status is Status.CONVERGED:
-        solution = with_grid_error(solution, settled, coarser_answer(settled, clock))
+        solution = with_grid_error(solution, settled, settled.coarser or coarser_answer(settled, clock))
     if solution.status is Status.CONVERGED:
         solution = with_box_error(solution, settled, clock)
     solution.stats.update(about)
@@ -121,12 +128,15 @@ def settled_on_host(
     if reach is not None and not reach.surely.all():
         warn_unreached(reach, problem.payoff, undiscounted=bool(problem.discount == 0))
     reached = None if reach is None else reach.surely
-    asked_again = sharpen and choices.levels and grid.size > COARSEST and not grid.sides("open")
-    start, shapes = coarse_levels.first_guess(task, on.scheme, method, start, clock, asked_again=asked_again)
-    settled = settle(staged(task, on.scheme), assumptions, reached, start, clock)
+    asked_again = sharpen and choices.levels and not grid.sides("open")
+    start, shapes, coarser = coarse_levels.first_guess(task, on.scheme, method, start, clock, asked_again=asked_again)
+    task = staged(task, on.scheme)
+    settled = settle(task, assumptions, reached, start, clock)
+    if settled.task is task:  # the nodes with prescribed values are those of the coarser grid
+        settled = settled._replace(coarser=coarser)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):
-        sharp = second_order(settled, on.scheme, clock)
+        sharp = second_order(settled, on.scheme, clock, to_grid_error=choices.to_grid_error)
         settled = better_of(settled, sharp, clock, sharpen=sharpen)
     if type(settled.task.method.evaluation) is not type(method.evaluation):
         about["method"] = settled.task.method.described(problem.is_game)

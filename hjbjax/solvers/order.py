@@ -43,7 +43,7 @@ def sharpened(task: Task, *, first: bool = False) -> Task:
         obstacles = dataclasses.replace(obstacles, lower=jnp.asarray(floor, task.tol.dtype))
     if task.crossing is not None and task.problem.noise is None and not task.problem.is_game:
         shift = jnp.asarray(0 if first else AHEAD / task.crossing, task.tol.dtype)
-    return dataclasses.replace(task, obstacles=obstacles, shift=shift)
+    return dataclasses.replace(task, obstacles=obstacles, shift=shift, weights=np.array([1, 0], task.tol.dtype))
 
 
 def raised(task: Task, assumptions: Assumptions, scheme: Scheme) -> tuple[Task, Assumptions]:

@@ -25,7 +25,8 @@ from hjbjax.solution.solution import Solution, question
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers import grid_error
 from hjbjax.solvers.arrival import warn_of_no_arrival
-from hjbjax.solvers.coarser_answer import CoarserAnswer
+from hjbjax.solvers.coarse_levels import CoarserAnswer
+from hjbjax.solvers.coarser_answer import SHARE, left_over
 from hjbjax.solvers.contact import contact_of_solve
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
@@ -43,7 +44,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
 
     The Isaacs gap has its own program, and nothing is compiled after a ``cut``.
     """
-    task, assumptions, reached, state, code, residuals, origin, note = settled
+    task, assumptions, reached, state, code, residuals, origin, _, note = settled
     stopped = cut or code in CUT
     mute = stopped or task.bare  # the actions are unknown
     if not mute:
@@ -90,6 +91,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
             "device": str(jax.devices()[0].device_kind),
             "dtype": str(state.value.dtype),
             "certificate": assumptions.sentence,
+            **({} if origin is None else {"high_order_tol": _allowed(task)}),
             **active_bounds(task.on, arrays["policy"]),
             "versions": {"jax": jax.__version__, "numpy": np.__version__},
         },
@@ -142,7 +144,8 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer
         chain=None if origin is None else np.asarray(origin.state.value),
         highest=_highest(settled),
     )
-    found = np.where(np.isfinite(value), grid_error.estimate_error(answers) + _left(solution, settled), 0)
+    error = grid_error.estimate_error(answers)
+    found = np.where(np.isfinite(value), error + _left(solution, settled, error), 0)
     warn_of_grid(found[None], value[None])
     return dataclasses.replace(solution, grid_error=found)
 
@@ -175,11 +178,12 @@ def _highest(settled: Settled) -> float:
     return grid_error.FIRST if settled.note else grid_error.SECOND
 
 
-def _left(solution: Solution, settled: Settled) -> float:
-    """The algebraic error of the iteration, cost units."""
-    error = solution.error
-    known = float(settled.state.progress.best[0]) if error is None else float(error)
-    return min(known, float(settled.task.tol))
+def _left(solution: Solution, settled: Settled, error: np.ndarray) -> np.ndarray:
+    """The algebraic error of the iteration, cost units, (*grid), for an estimate ``error`` of the grid's."""
+    if solution.error is None and settled.task.weights is not None:
+        return left_over(settled.task, error)
+    known = float(settled.state.progress.best[0]) if solution.error is None else float(solution.error)
+    return np.full(error.shape, min(known, float(settled.task.tol)))
 
 
 def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solution:
@@ -377,6 +381,12 @@ def within_reach(best: float) -> str:
     return f"{Status.STALLED.message} The smallest error was {best:.2g}: a tolerance of {2 * best:.2g} is within reach."
 
 
+def _allowed(task: Task) -> str:
+    """The tolerance of a high-order solution: a number, or a share of the grid error."""
+    tol, strict = float(task.tol), float(np.asarray(task.weights)[0]) == 1
+    return f"{tol:.2g}" if strict else f"{SHARE:.0%} of the estimated grid error"
+
+
 def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     """The sentence with the outcome of a solve and a remedy."""
     if code is Status.NONFINITE:
@@ -398,7 +408,7 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
         return f"Residual and last step are at most {tol:.2g}; no certificate bounds the error."
     if code is Status.CONVERGED and task.certificate is Certificate.RESIDUAL:
         return (
-            f"Residual of the high-order equation and distance to its limit are at most {tol:.2g} in "
+            f"Residual of the high-order equation and distance to its limit are at most {_allowed(task)} in "
             f"{task.problem.payoff} units."
         )
     return task.problem.labels.word(code.message)

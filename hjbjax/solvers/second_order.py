@@ -7,7 +7,7 @@ from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import Status
 from hjbjax.solvers import grid_error, nested_grids
 from hjbjax.solvers.coarse_levels import fill_unreachable
-from hjbjax.solvers.coarser_answer import coarser_answer
+from hjbjax.solvers.coarser_answer import coarser_answer, comparison, stop_at
 from hjbjax.solvers.order import raised
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.stationary_run import iterate
@@ -15,20 +15,39 @@ from hjbjax.solvers.stationary_run import iterate
 LITTLE = 0.1  # fraction of the range of V by which the second order may change V without further checks
 
 
-def second_order(settled: Settled, scheme: Scheme, clock: Clock) -> Settled:
+def second_order(settled: Settled, scheme: Scheme, clock: Clock, *, to_grid_error: bool) -> Settled:
     """The solution by a high-order scheme, started from the monotone one, which it keeps as its ``origin``.
 
     If the clock stops it before its initial evaluation, the monotone solution is returned with the status of the stop.
+    ``to_grid_error`` as in ``raise_order``.
     """
     over = clock.over()
     if over is not None:
         return settled._replace(code=over)
-    task, assumptions = raised(settled.task, settled.assumptions, scheme)
-    sharp = settled._replace(task=task, assumptions=assumptions, origin=settled)
+    sharp = raise_order(settled, scheme, clock, to_grid_error=to_grid_error)
     state, ended, residuals = iterate(sharp.running, settled.state.value, clock)
     if not state.progress.has_begun:
         return settled._replace(code=ended)
     return sharp._replace(state=state, code=ended, residuals=residuals)
+
+
+def raise_order(settled: Settled, scheme: Scheme, clock: Clock, *, to_grid_error: bool) -> Settled:
+    """The task of a high-order scheme, with the state of the monotone solution, its ``origin``.
+
+    With ``to_grid_error`` its iteration may stop at a fraction of the error of the grid at every node. Both solutions
+    on the next coarser grid are computed for this, and kept as ``coarser``.
+    """
+    task, assumptions = raised(settled.task, settled.assumptions, scheme)
+    sharp = settled._replace(task=task, assumptions=assumptions, origin=settled)
+    if not to_grid_error:
+        return sharp
+    first, second, error = comparison(settled, sharp, clock)
+    sharp = sharp._replace(origin=settled._replace(coarser=first), coarser=second)
+    return (
+        sharp
+        if error is None
+        else sharp._replace(task=stop_at(task, error, fill_unreachable(settled.task, settled.state)))
+    )
 
 
 def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) -> Settled:
@@ -39,6 +58,7 @@ def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) 
     """
     if not sharpen:
         return sharp
+    settled = sharp.origin or settled  # with its answer on the coarser grid
     if sharp.code is not Status.CONVERGED:
         # Ctrl-C leaves the solve unfinished; after a time limit the monotone answer is complete
         code = sharp.code if sharp.code is Status.INTERRUPTED else settled.code
@@ -58,7 +78,7 @@ def _contradiction(settled: Settled, sharp: Settled, clock: Clock) -> str | None
     moved = float(np.max(nested_grids.apart(before, after)))
     if moved <= LITTLE * float(np.ptp(before)):
         return None
-    found = coarser_answer(settled, clock)
+    found = settled.coarser or coarser_answer(settled, clock)
     if found.grid is None or found.value is None:
         return None
     coarse, value = found.grid, found.value

@@ -13,6 +13,7 @@ from hjbjax.iteration.methods import PolicyIteration
 from hjbjax.problem.types import Mask, Nodes
 from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
+from hjbjax.solvers.coarse_levels import CoarserAnswer
 from hjbjax.solvers.order import at_order
 from hjbjax.solvers.setup import Assumptions, forced_only, linear_solve
 from hjbjax.solvers.stationary_run import iterate
@@ -33,6 +34,7 @@ class Settled(NamedTuple):
       code: its status.
       residuals: the residuals of all steps.
       origin: the end of the monotone iteration from which a second-order iteration started.
+      coarser: the answer of the same scheme on the next coarser grid, if it was computed on the way.
       note: a further sentence of the solution's message.
     """
 
@@ -43,6 +45,7 @@ class Settled(NamedTuple):
     code: Status
     residuals: np.ndarray
     origin: "Settled | None" = None
+    coarser: CoarserAnswer | None = None
     note: str = ""
 
     @property
@@ -50,7 +53,7 @@ class Settled(NamedTuple):
         """The task of the compiled program: for a high-order solution this may be the program of its chain."""
         if self.origin is None or self.origin.task.first_order is None:
             return self.task
-        return at_order(self.origin.task, first=False)
+        return dataclasses.replace(at_order(self.origin.task, first=False), weights=self.task.weights)
 
     def of_chain(self) -> "Settled":
         """The end of a monotone iteration without traces of the scheme whose program it shared."""

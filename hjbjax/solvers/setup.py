@@ -35,6 +35,7 @@ DIRECT = 50_000  # largest plane grid with open ends that is solved by sparse LU
 BETWEEN_PARTS, MANY = 5, 10**6  # sweeps, and the number of nodes above which they are used
 LINKS = 200_000  # largest grid whose cut links are stored: 34 bytes per node and axis, but half the compile time
 NEST = 100_000  # nodes above which compiling coarser grids pays
+TOL = 1e-3  # the default tolerance, cost units
 COARSEST = 20_000  # nodes of the coarsest grid: for fewer a step takes under a millisecond, but compiling a second
 
 

@@ -32,7 +32,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, memory, nested_grids, semi_lagrangian, transformed
 from hjbjax.solvers.host_solve import Choices, solve_on_host
 from hjbjax.solvers.result import solution_at_start, with_last_phase
-from hjbjax.solvers.setup import check_on_one_state, choose
+from hjbjax.solvers.setup import TOL, check_on_one_state, choose
 from hjbjax.solvers.transformed import Asked
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -50,7 +50,7 @@ def solve(
     *,
     method: Method | None = None,
     scheme: Scheme | None = None,
-    tol: float = 1e-3,
+    tol: float | None = None,
     guess: Nodes | None = None,
     dtype: DType | None = None,
     max_steps: int | None = None,
@@ -79,7 +79,9 @@ def solve(
         the message of the solution reports this.
       tol: bound on |V − V_h| to reach, in cost units, where V_h is the exact solution on the grid of the monotone
         scheme. Without a certificate, which the solution reports, and for the high-order equation, it bounds the
-        residual and the last step. A tube without discount continues until V no longer changes.
+        residual and the distance to the limit of the iteration. ``None`` is 1e-3; if ``scheme`` is ``None`` too, the
+        high-order iteration also stops at a tenth of the estimated grid error. A tube without discount continues
+        until V no longer changes.
       guess: initial node values, shape (*grid); not for a tube without discount, which has many fixed points.
       dtype: ``None`` is float64; inside a transformation the result is rounded to the type of ``float`` there.
         ``"float32"`` for memory, with a tolerance that float32 can reach.
@@ -132,8 +134,8 @@ def solve(
         own = arguments.traced_dtype(dtype, "solve")
         inner = np.dtype(np.float64) if dtype is None else own
         x64 = np.float64 in (inner, jnp.result_type(float))
-        asked = Asked(method, scheme, max_steps, time_limit, throw, own, inner, x64)
-        return _solve_traced(problem, grid, asked, guess, tol)
+        asked = Asked(method, scheme, tol is None, max_steps, time_limit, throw, own, inner, x64)
+        return _solve_traced(problem, grid, asked, guess, TOL if tol is None else tol)
     kind = arguments.as_dtype(dtype)
     check_node_values(guess, grid, "solve: the guess")
     check_spacings(grid, kind)
@@ -142,6 +144,8 @@ def solve(
         checkpoint, [problem], grid, resume=resume, caller="solve", together=clock.together, method=method,
         scheme=scheme, tol=tol, guess=guess, dtype=kind,
     )  # fmt: skip
+    choices = Choices(scheme is None, free, levels=free, tol=tol is None)
+    tol = TOL if tol is None else tol
     if scheme is not None and paths is not None:
         with (
             noting_interrupts(clock),
@@ -155,7 +159,6 @@ def solve(
         return _ended(with_last_phase(solution, clock), clock, tol, throw=throw)
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
     on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind)
-    choices = Choices(scheme=scheme is None, method=free, levels=free)
     # float64 for this call only: other threads, and the caller's own programs, keep their type
     with (
         noting_interrupts(clock),
@@ -224,7 +227,8 @@ def check_arguments(
     if scheme is not None:
         schemes.check_scheme(scheme, "solve: scheme", grid, stationary=True)
     word = problem.labels.word
-    arguments.positive(tol, "solve: tol", word("in the units of the cost"))
+    if tol is not None:
+        arguments.positive(tol, "solve: tol", word("in the units of the cost"))
     if guess is not None and is_constrained(problem) and is_discounted(problem) is False:
         raise ValueError(
             f"solve: without discount a {word('stopping_cost')} or a running_max has many fixed points, and the "

@@ -53,6 +53,7 @@ class Asked:
 
     Attributes:
       method, scheme: as in ``solve``.
+      free_tol: True if the caller left the tolerance open.
       max_steps, time_limit, throw: as in ``solve``.
       dtype: the dtype of the result and its derivatives.
       inner: the floating-point type in which the host solves.
@@ -61,6 +62,7 @@ class Asked:
 
     method: Method | None
     scheme: Scheme | None
+    free_tol: bool
     max_steps: int | None
     time_limit: float | None
     throw: bool
@@ -262,7 +264,7 @@ def _solved(
     """The result of one lane, in NumPy; its warnings are dropped, because the user's line is not on the stack."""
     with own_settings(x64=asked.x64), keeping_warnings():
         check_spacings(grid, asked.inner)
-        choices = Choices(scheme=asked.scheme is None, method=method is None, levels=method is None)
+        choices = Choices(asked.scheme is None, method is None, levels=method is None, tol=asked.free_tol)
         may_follow = _may_follow(asked, problem, grid)
         method = choose(problem, grid, traced=False, method=method)
         on = Discretisation(problem, grid, asked.scheme or Upwind(subcell=True), asked.inner)

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from benchmarks.harness.report import RESULTS
+from benchmarks.harness.thresholds import THRESHOLDS
 
 SIZES = ([200, 201], [400, 401], [800, 801], [1600, 1601])
 OURS, NUMBA, THEIRS = "hjbjax", "numba", "hj_reachability"
@@ -140,8 +141,20 @@ def lines(folder: Path = RESULTS) -> list[str]:
     ]
 
 
+def missed(folder: Path = RESULTS) -> list[str]:
+    """The lines of the table of missed thresholds."""
+    found = []
+    for path in sorted(folder.glob("*.json")):
+        for row in rows_of(folder, path.stem, status="MISSED"):
+            threshold = next((each for each in THRESHOLDS.values() if each.figure == row["figure"]), None)
+            sign = "" if threshold is None else "at most " if threshold.most else "at least "
+            found.append(f"| {row['figure']} | {number(row['measured'])} | {sign}{number(row['floor'])} |")
+    return found
+
+
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=RESULTS, help="Folder of the rows.")
 def command(out: Path) -> None:
-    """Print the table of measurements from the recorded rows."""
+    """Print the tables of measurements and of missed thresholds from the recorded rows."""
     click.echo("\n".join(["| figure | case | measured |", "|---|---|---|", *lines(out)]))
+    click.echo("\n".join(["", "| figure | measured | threshold |", "|---|---|---|", *missed(out)]))

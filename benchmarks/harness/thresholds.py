@@ -43,12 +43,15 @@ DEVICES = "pendulum {} to 1e-3, seconds on two devices of one processor over tho
 THRESHOLDS = {
     "sweep 1024": Threshold("sweep on 1024 x 1024, 21 controls, float32, against the numba loop", 1.5, 2.5),
     "sweep 2048": Threshold("sweep on 2048 x 2048, 21 controls, float32, against the numba loop", 1.5, 2.5),
+    "step 1024": Threshold("whole step on 1024 x 1024, 21 controls, float32, against the numba loop", 4.5),
     "sweep 6-D": Threshold("one value-iteration sweep on 20^6, beside two values", 16, unit=" bytes a node", most=True),
     "quantecon": Threshold(f"{CHAIN}, compiled", 20, 50),
     "quantecon cold": Threshold(f"{CHAIN}, our compile time counted", 2, 3.5),
     "numba 200 nested": Threshold(HAND.format("200 x 201, both by nested grids,"), 1.2, 1.5),
-    "numba 800": Threshold(HAND.format("800 x 801"), 1.5, 3.5),
-    "numba 1600": Threshold(HAND.format("1600 x 1601"), 1.5, 3.5),
+    "numba 200": Threshold(HAND.format("200 x 201"), 1.5),
+    "numba 400": Threshold(HAND.format("400 x 401"), 3.5),
+    "numba 800": Threshold(HAND.format("800 x 801"), 6.5),
+    "numba 1600": Threshold(HAND.format("1600 x 1601"), 5),
     "growth": Threshold("pendulum, seconds at 1600 x 1601 over those at 400 x 401", 24, most=True),
     "growth undiscounted": Threshold(
         "pendulum without discount, by default, seconds at 1600 x 1601 over those at 400 x 401", 22, most=True
@@ -63,7 +66,9 @@ THRESHOLDS = {
     "first pendulum 801": Threshold(FIRST.format("800 x 801"), 4.2, 2.2, most=True),
     "cold default 201": Threshold(COLD.format("200 x 201"), 1.3, most=True),
     "cold default 401": Threshold(COLD.format("400 x 401"), 1.3, most=True),
-    "warm default 401": Threshold(f"pendulum 400 x 401, warm, {DEFAULT}", 3, 2, most=True),
+    "warm default 101": Threshold(f"pendulum 100 x 101, warm, {DEFAULT}", 2, most=True),
+    "warm default 201": Threshold(f"pendulum 200 x 201, warm, {DEFAULT}", 1.8, most=True),
+    "warm default 401": Threshold(f"pendulum 400 x 401, warm, {DEFAULT}", 1.8, most=True),
     "programs": Threshold("pendulum by default, the most programs compiled", 14, unit="", most=True),
     "quantecon cold 160": Threshold("pendulum 160 x 161, 31 controls, our first answer against QuantEcon's", 1.8, 2.5),
     "quantecon cold 200": Threshold("pendulum 200 x 201, 21 controls, our first answer against QuantEcon's", 3, 4),

@@ -118,7 +118,7 @@ def _prolong(V):
     return out[:-1].copy()
 
 
-def solve(N, K=21, beta=0.1, tol=1e-3, sweeps=5):
+def solve(N, K=21, beta=0.1, tol=1e-3, sweeps=3):  # with 5 sweeps it is 4 to 18 % slower
     levels = [N]
     while levels[0] % 2 == 0 and levels[0] > 50:
         levels.insert(0, levels[0] // 2)

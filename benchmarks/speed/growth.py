@@ -80,10 +80,11 @@ def first(case: Case, size: int, time_limit: float | None) -> dict[str, Any]:
 def solve(case: Case, size: int, time_limit: float | None) -> hjb.Solution:
     """The answer, whatever its status."""
     problem, grid = case.build(size)
-    scheme = hjb.Upwind() if case.first_order else None
+    # by default the second-order iteration stops by the error of the grid
+    scheme, tol = (hjb.Upwind(), case.tol) if case.first_order else (None, None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", hjb.SolveWarning)  # nodes that cannot reach the target
-        return hjb.solve(problem, grid, tol=case.tol, time_limit=time_limit, throw=False, scheme=scheme)
+        return hjb.solve(problem, grid, tol=tol, time_limit=time_limit, throw=False, scheme=scheme)
 
 
 def in_turns(case: Case, rows: list[dict[str, Any]], repeats: int, time_limit: float | None) -> list[dict[str, Any]]:

@@ -264,8 +264,8 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, float]:
     """The figures with a threshold that these rows contain."""
     figures = {}
     for row in rows:
-        if row.get("kernel") == "sweep" and row.get("controls") == 21 and "against_numba" in row:
-            figures[f"sweep {row['shape'][0]}"] = row["against_numba"]
+        if row.get("kernel") in ("sweep", "step") and row.get("controls") == 21 and "against_numba" in row:
+            figures[f"{row['kernel']} {row['shape'][0]}"] = row["against_numba"]
         if row.get("shape") == list(SIX) and row["problem"] == "memory":
             figures["sweep 6-D"] = max(figures.get("sweep 6-D", 0.0), row["bytes_beyond"])
     return {name: value for name, value in figures.items() if name in thresholds.THRESHOLDS}

@@ -288,7 +288,8 @@ def one_sided(values: Field, grid: Grid, axis: int, link: Links | None = None) -
         up = jnp.where(*link.meets_up, up)
     if link.meets_down is not None:
         down = jnp.where(*link.meets_down, down)
-    return (up - values) / link.up, (values - down) / link.down
+    # products, because XLA stores quotients that several expressions read
+    return (up - values) * (1 / link.up), (values - down) * (1 / link.down)
 
 
 def _neighbours(values: Field, grid: Grid, axis: int) -> tuple[Field, Field]:

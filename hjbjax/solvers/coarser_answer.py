@@ -107,12 +107,12 @@ def stop_at(task: Task, error: np.ndarray, value: np.ndarray) -> Task:
     return dataclasses.replace(task, weights=weights.astype(task.tol.dtype))
 
 
-def left_over(task: Task, error: np.ndarray) -> np.ndarray:
-    """The error that the iteration of ``stop_at`` may leave, (*grid): spread like the estimate of the grid's."""
-    least, tol = np.asarray(task.weights, float), float(task.tol)
-    if least[1] == 0 or np.max(error) == 0:
-        return np.full(error.shape, tol)
-    return np.minimum(tol / least[0], tol / least[1] + tol / least[0] * error / np.max(error))
+def left_over(task: Task, left: float, error: np.ndarray) -> np.ndarray:
+    """The error of the iteration, (*grid), for its norm ``left``; it is spread like the estimate of the grid error."""
+    largest, mean = np.asarray(task.weights, float)
+    if mean == 0 or np.max(error) == 0:
+        return np.full(error.shape, left / largest)
+    return np.minimum(left / largest, left / mean + left / largest * error / np.max(error))
 
 
 def _level(task: Task, clock: Clock) -> Task | CoarserAnswer:

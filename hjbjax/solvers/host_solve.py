@@ -24,7 +24,7 @@ from hjbjax.solvers.result import finish, solution_at_start, with_grid_error
 from hjbjax.solvers.second_order import better_of, second_order
 from hjbjax.solvers.semi_lagrangian import Followed
 from hjbjax.solvers.settle import Settled, settle
-from hjbjax.solvers.setup import choose_scheme, prepare_on_host, warn_unreached
+from hjbjax.solvers.setup import COARSEST, choose_scheme, prepare_on_host, warn_unreached
 from hjbjax.well_posedness import admissibility, node_checks
 
 
@@ -128,7 +128,7 @@ def settled_on_host(
     if reach is not None and not reach.surely.all():
         warn_unreached(reach, problem.payoff, undiscounted=bool(problem.discount == 0))
     reached = None if reach is None else reach.surely
-    asked_again = sharpen and choices.levels and not grid.sides("open")
+    asked_again = sharpen and choices.levels and grid.size > COARSEST and not grid.sides("open")
     start, shapes, coarser = coarse_levels.first_guess(task, on.scheme, method, start, clock, asked_again=asked_again)
     task = staged(task, on.scheme)
     settled = settle(task, assumptions, reached, start, clock)

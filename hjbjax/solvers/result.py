@@ -180,10 +180,11 @@ def _highest(settled: Settled) -> float:
 
 def _left(solution: Solution, settled: Settled, error: np.ndarray) -> np.ndarray:
     """The algebraic error of the iteration, cost units, (*grid), for an estimate ``error`` of the grid's."""
-    if solution.error is None and settled.task.weights is not None:
-        return left_over(settled.task, error)
     known = float(settled.state.progress.best[0]) if solution.error is None else float(solution.error)
-    return np.full(error.shape, min(known, float(settled.task.tol)))
+    left = min(known, float(settled.task.tol))
+    if solution.error is None and settled.task.weights is not None:
+        return left_over(settled.task, left, error)
+    return np.full(error.shape, left)
 
 
 def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solution:

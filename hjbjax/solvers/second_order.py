@@ -38,7 +38,7 @@ def raise_order(settled: Settled, scheme: Scheme, clock: Clock, *, to_grid_error
     on the next coarser grid are computed for this, and kept as ``coarser``.
     """
     task, assumptions = raised(settled.task, settled.assumptions, scheme)
-    sharp = settled._replace(task=task, assumptions=assumptions, origin=settled)
+    sharp = settled._replace(task=task, assumptions=assumptions, origin=settled, coarser=None)
     if not to_grid_error:
         return sharp
     first, second, error = comparison(settled, sharp, clock)

@@ -112,6 +112,8 @@ def test_the_tables_of_measurements_are_what_the_benchmarks_wrote():
     recorded = quoted.lines()
     whole = PAGES["benchmarks"].split("a test compares the two:\n\n")[1].split("\n\n")[0]
     assert whole.splitlines()[2:] == recorded
+    missed = PAGES["benchmarks"].split("## Missed thresholds\n\n")[1].split("\n\n")[1]
+    assert missed.splitlines()[2:] == quoted.missed()
     table = README.split("a test compares the two:\n\n")[1].split("\n\n")[0].splitlines()[2:]
     assert len(table) >= 4
     assert set(table) <= set(recorded)

@@ -25,7 +25,7 @@ MORE = [
 )
 def test_a_pendulum_of_several_swings_does_not_slide_off_its_rest_node(torque, shape, known):
     """Undiscounted: it ended at V = -29 for costs that are not negative, CONVERGED."""
-    solution = hjb.solve(*zoo.pendulum(torque=torque, shape=shape))
+    solution = hjb.solve(*zoo.pendulum(torque=torque, shape=shape), tol=1e-3)
     assert solution.status is hjb.Status.CONVERGED
     assert "first order" not in solution.message
     assert solution.value.min() == 0
@@ -47,8 +47,8 @@ def test_units_of_time_and_cost_do_not_matter(time, cost):
 def test_an_answer_that_contradicts_the_certified_one_is_not_returned(monkeypatch):
     second_order = host_solve.second_order
 
-    def slid(settled, scheme, clock):
-        sharp = second_order(settled, scheme, clock)
+    def slid(*arguments, **options):
+        sharp = second_order(*arguments, **options)
         return sharp._replace(state=dataclasses.replace(sharp.state, value=sharp.state.value - 1000))
 
     problem, grid = zoo.pendulum(torque=2.0, shape=(60, 61))

@@ -88,7 +88,8 @@ def test_a_slow_way_to_the_limit_is_not_halved(count):
 
 def test_each_grid_is_solved_once_by_each_scheme(iterations):
     hjb.solve(line(), hjb.Grid([-1.0], [1.0], (41,)))
-    assert iterations == [("Upwind", (41,)), ("Limited", (41,)), ("Limited", (21,))]
+    # on the coarser grid first for an estimate of the error of the grid, then up to a tenth of it
+    assert iterations == [("Upwind", (41,)), ("Upwind", (21,)), *[("Limited", (21,))] * 2, ("Limited", (41,))]
 
 
 def test_one_program_serves_the_chain_and_the_second_order():

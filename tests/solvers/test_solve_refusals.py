@@ -167,7 +167,7 @@ def test_correlated_noise_without_a_chain():
 # --- other arguments ---
 
 
-@pytest.mark.parametrize("tol", ["1e-3", None])
+@pytest.mark.parametrize("tol", ["1e-3", object()])
 def test_tolerance_that_is_no_number(tol):
     refusal((ValueError, TypeError), "tol", repr(tol), tol=tol)
 

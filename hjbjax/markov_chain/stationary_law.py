@@ -65,12 +65,14 @@ def law(generator: "csr_array", states: np.ndarray) -> tuple[np.ndarray, float]:
     pinned = len(states) // 2
     for _ in range(PASSES):
         found, error = _from(outflow, pinned)
-        peak = int(np.argmax(np.where(np.isfinite(found), found, np.inf)))
-        if np.all(np.isfinite(found)) and found[peak] <= NEAR_PEAK:
+        # seen from a state that is hardly ever visited, rounding may give the largest entries the wrong sign
+        sizes = np.where(np.isfinite(found), np.abs(found), np.inf)
+        peak = int(np.argmax(sizes))
+        if sizes[peak] <= NEAR_PEAK:
             break
         pinned = peak
     total = found.sum()
-    if not (np.isfinite(total) and error < np.inf):
+    if not (0 < total < np.inf and error < np.inf):
         return probabilities, np.inf
     probabilities[states] = np.maximum(found, 0) / total  # rounding must not make a probability negative
     return probabilities, error / total

@@ -84,6 +84,7 @@ def from_gymnasium(
     return Finite([[float(number) for number in point] for point in itertools.product(*ranges)])
 
 
+@front_door
 def discount_rate(gamma: Number, dt: Number) -> Any:
     """The discount per unit time, β = −log(γ)/dt, of a factor γ per step: γ^(t/dt) = e^(−βt).
 

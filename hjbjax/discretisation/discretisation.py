@@ -285,6 +285,13 @@ class Discretisation:
         rates = self.problem.mode_rates
         return [] if rates is None else list(components.components(rates, *self._arguments(u, d, x), dtype=self.dtype))
 
+    def growth(self, u: list, d: list | None = None, x: list | None = None) -> list:
+        """The growth rate of the payments, one entry; empty without growth."""
+        growth = self.problem.growth
+        if growth is None:
+            return []
+        return [components.scalar(growth, *self._arguments(u, d, x), dtype=self.dtype)]
+
     def intensities(self, u: list, d: list | None = None, x: list | None = None) -> list:
         """The rates of the jumps of the state; empty without jumps."""
         rates = self.problem.intensities

@@ -1,10 +1,11 @@
-"""Decorators of public functions, for problems with modes, jumps, pushes, or bounds or discounts of the state.
+"""Decorators of public functions, for problems with modes, jumps, pushes, growth, or bounds or discounts of the state.
 
 The solvers support fixed sets of controls and constant discounts, modes as the first entry of the state, and all jumps
 and all pushes as functions. A decorated function receives such a problem, and its grid, instead of the user's. In the
 solutions that it returns, the controls and the problem are the user's again. The grid keeps its axis of modes.
 """
 
+import functools
 import inspect
 import itertools
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import numpy as np
 
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
+from hjbjax.problem import sets
 from hjbjax.problem.arguments import with_calls_by_name
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.jump_terms import with_jump_functions, with_mean_jump_costs
@@ -25,10 +27,16 @@ from hjbjax.problem.pytree import altered, cast, is_traced
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import bounds_at, control_of, in_unit_box, with_any_control
-from hjbjax.problem.time_change import in_own_time, with_killing
+from hjbjax.problem.time_change import (
+    has_variable_discount,
+    in_own_time,
+    net_discount,
+    with_killing,
+    with_least_discount,
+)
 from hjbjax.problem.types import Array, Scalar
 from hjbjax.solution.solution import Solution, change_solutions
-from hjbjax.tracing import checks
+from hjbjax.tracing import checks, components
 from hjbjax.tracing.closures import holds_tracers, settled, settled_function
 
 P = ParamSpec("P")
@@ -38,9 +46,14 @@ T = TypeVar("T")
 def without_horizon(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function of (problem or problems, grid, ...) without a horizon.
 
-    Problems without modes, jumps and pushes, with a constant discount, and with a fixed set of controls or no control,
-    pass through unchanged.
+    Problems without modes, jumps, pushes and growth, with a constant discount, and with a fixed set of controls or no
+    control, pass through unchanged.
     """
+    return _posing(function, _with_least_discount)
+
+
+def in_time_of_discount(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator like ``without_horizon`` that gives all states and controls the discount one."""
     return _posing(function, _in_own_time)
 
 
@@ -109,10 +122,10 @@ def with_mode_axis(*of_state: str) -> Callable[[Callable[P, T]], Callable[P, T]]
 
 
 def _needs_posing(problem: object) -> bool:
-    """True for a problem with modes, jumps or pushes, or whose bounds or discount are functions of the state."""
+    """True for a problem with modes, jumps, pushes or growth, or with bounds or a discount that depend on the state."""
     if not isinstance(problem, Problem):
         return False
-    return _is_joined(problem) or callable(problem.discount) or callable(problem.controls)
+    return _is_joined(problem) or has_variable_discount(problem) or callable(problem.controls)
 
 
 def _has_modes(problem: object) -> bool:
@@ -226,11 +239,18 @@ _at_all_jit = jax.jit(_at_all)
 
 
 def _in_own_time(problem: Problem, grid: Grid, name: str) -> Problem:
-    """Check β at the nodes, and return the problem in the time τ with dτ = β(x) dt."""
-    if not callable(problem.discount) or problem.time_dependent:  # a function of time is refused
+    """Check β − g at the nodes, and return the problem in the time τ with dτ = (β − g) dt."""
+    if problem.time_dependent or not has_variable_discount(problem):  # a function of time is refused
         return problem
     _check_rate(problem, grid, name)
     return in_own_time(problem)
+
+
+def _with_least_discount(problem: Problem, grid: Grid, name: str) -> Problem:
+    """Check β − g at the nodes, and return the problem with a constant discount, and with growth ≤ 0 if it has any."""
+    if problem.growth is None or problem.time_dependent:
+        return _in_own_time(problem, grid, name)
+    return with_least_discount(problem, _check_rate(problem, grid, name))
 
 
 def _with_killing(problem: Problem, grid: Grid, name: str) -> Problem:
@@ -238,17 +258,28 @@ def _with_killing(problem: Problem, grid: Grid, name: str) -> Problem:
     return with_killing(problem)
 
 
-def _check_rate(problem: Problem, grid: Grid, name: str) -> None:
-    """Refuse a discount that is not positive and finite at every node; host level."""
+def _check_rate(problem: Problem, grid: Grid, name: str) -> Any:
+    """The least β − g over nodes and controls; refuse a discount that is not positive and finite at every node."""
     ready = settled(problem, grid.ndim)
     if is_traced(ready, grid):  # the values are unknown; where β ≤ 0 the solution is NaN
-        return
+        if problem.growth is None:
+            return None
+        least, _, faulty = _least(Discretisation(ready, grid, Upwind(), np.dtype(jnp.result_type(float))))
+        # the value does not depend on the split into a discount and a growth, so neither does its derivative
+        return jax.lax.stop_gradient(jnp.where(faulty > 0, jnp.nan, least))
     with jax.core.eval_context(), own_settings(x64=True):
         known = cast((ready, grid), np.float64)
         least, where, faulty = jax.device_get(_least(Discretisation(*known, Upwind(), np.dtype(np.float64))))
     if not faulty:
-        return
+        return float(least)
     x = grid.state(tuple(int(i) for i in np.unravel_index(int(where), grid.shape)))
+    if problem.growth is not None:
+        raise ValueError(
+            f"{name}: discount - growth(x, u) is {least:.6g} at x = {np.asarray(x).tolist()} for some admissible "
+            f"control, the first of {int(faulty)} nodes where it is not a positive number;\n"
+            "wanted discount > growth for all admissible controls: otherwise the payments may grow faster than they "
+            "are discounted.\nNarrow the controls, or march over a horizon"
+        )
     raise ValueError(
         f"{name}: discount(x) is {least:.6g} at x = {np.asarray(x).tolist()}, the first of {int(faulty)} nodes where "
         "it is not a positive number; wanted discount(x) > 0 everywhere:\n"
@@ -259,10 +290,22 @@ def _check_rate(problem: Problem, grid: Grid, name: str) -> None:
 
 @jax.jit
 def _least(on: Discretisation) -> tuple[Scalar, Scalar, Scalar]:
-    """β at the first node where it is not positive and finite, the flat index of the node, and the number of nodes."""
-    rate = on.at_nodes(on.problem.discount)
+    """β − g at the first node where it is not positive and finite, its flat index, and the number of these nodes.
+
+    Without one, the first number is the least β − g.
+    """
+    problem = on.problem
+    if problem.growth is None:
+        rate = on.at_nodes(problem.discount)
+    else:
+        sets_of, net = (problem.controls, problem.disturbances), net_discount(problem)
+        found = [
+            components.scalar(net, *problem.arguments(on.coordinates(), u, d), dtype=on.dtype)
+            for u, d in itertools.product(*(sets.probes(each, on.dtype) for each in sets_of))
+        ]
+        rate = jnp.broadcast_to(functools.reduce(jnp.minimum, found), on.grid.shape)
     faulty = ~((rate > 0) & (rate < jnp.inf))
-    where = jnp.argmax(faulty)
+    where = jnp.where(jnp.any(faulty), jnp.argmax(faulty), jnp.argmin(rate))
     return rate.reshape(-1)[where], where, jnp.sum(faulty)
 
 

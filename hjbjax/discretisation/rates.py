@@ -45,16 +45,19 @@ class Rates:
       values: for each offset the rates c_o ≥ 0 per unit time, shape (*grid); none leads out of the box.
       one_way: True if at most one of two opposite jumps has a positive rate, as without noise.
       landings: the jumps to other nodes than neighbours, with their rates.
+      ending: the rate at which paths end without a payment, (*grid): minus the growth of the payments. None for zero.
     """
 
     offsets: tuple[Offset, ...]
     values: tuple[Any, ...]
     one_way: bool = False
     landings: tuple[Landing, ...] = ()
+    ending: Any = None
 
     def total(self) -> Any:
-        """Q = Σ_o c_o, the rate at which the chain leaves each node, shape (*grid)."""
-        first, *others = (*self.values, *(landing.rate for landing in self.landings))
+        """Q = Σ_o c_o plus the rate of ending, at which the chain leaves each node, shape (*grid)."""
+        ending = [] if self.ending is None else [self.ending]
+        first, *others = (*self.values, *(landing.rate for landing in self.landings), *ending)
         return sum(others, start=first)  # start=0 would cost one more array
 
     def apply(self, grid: Grid, values: jax.Array) -> jax.Array:
@@ -68,7 +71,8 @@ class Rates:
     def scaled(self, factor: Any) -> "Rates":
         """Every rate times ``factor``, shape (*grid) or a number."""
         values, landings = (factor * c for c in self.values), (each.weighed(factor) for each in self.landings)
-        return dataclasses.replace(self, values=tuple(values), landings=tuple(landings))
+        ending = None if self.ending is None else factor * self.ending
+        return dataclasses.replace(self, values=tuple(values), landings=tuple(landings), ending=ending)
 
     def kept(self, mask: Any) -> "Rates":
         """The rates where ``mask`` is true, bool (*grid), and zero elsewhere, also instead of NaN; on the host too."""
@@ -110,7 +114,8 @@ def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
         for nodes, weight in zip(found.nodes, found.weights, strict=True)
     )
     one_way = on.problem.noise is None and on.scheme.chain.one_way and not others
-    return Rates(tuple(table), values, one_way, landings)
+    ending = next((jnp.broadcast_to(-growth, grid.shape) for growth in on.growth(u, d, x)), None)
+    return Rates(tuple(table), values, one_way, landings, ending)
 
 
 def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[Offset, Any]:
@@ -158,7 +163,10 @@ def fastest_rate(on: Discretisation) -> jax.Array:
         theirs = (_table(on, on.drifts(us[0], d)[1], {}) for d in ds)
         tables = ([sum(table.values()) for table in each] for each in (mine, theirs))
         pairs = itertools.product(us, ds)
-        switching = [sum([*on.mode_rates(u, d), *on.intensities(u, d)], start=result) for u, d in pairs]
+        switching = [
+            sum([*on.mode_rates(u, d), *on.intensities(u, d), *(-each for each in on.growth(u, d))], start=result)
+            for u, d in pairs
+        ]
         return functools.reduce(jnp.maximum, switching) + sum(functools.reduce(jnp.maximum, each) for each in tables)
     for u, d in itertools.product(us, ds):
         result = jnp.maximum(result, jump_rates(on, u, d).total())

@@ -34,6 +34,11 @@ def check_problem(problem: object, tol: float, max_nodes: int) -> None:
             "pontryagin: got a discount that is a function of the state, wanted a number; make ∫ discount dt a state z "
             "with z(0) = 0, and multiply the costs by exp(−z)"
         )
+    if problem.growth is not None:
+        raise ValueError(
+            "pontryagin: got a problem with growth, wanted one without; make ∫ (discount - growth) dt a state z with "
+            "z(0) = 0, and multiply the costs by exp(−z)"
+        )
     if callable(problem.controls):
         raise ValueError(
             "pontryagin: got bounds of the controls that depend on the state, wanted a fixed set; solve it on a grid"

@@ -1,7 +1,7 @@
-"""Simulation with a discount that is a function of the state: ∫ β dt along the path is one more entry of the state.
+"""Simulation with a discount that is not constant: ∫ (β − g) dt along the path is one more entry of the state.
 
-Let z = ∫ β(x(s)) ds. The loop with the state (x, z) has no discount, and its payments are e^{−z} times the payments of
-the problem. The integrator therefore only needs to support constant discounts.
+Let z = ∫ (β(x) − g(x, u)) ds. The loop with the state (x, z) has no discount, and its payments are e^{−z} times the
+payments of the problem. The integrator therefore only needs to support constant discounts.
 """
 
 import dataclasses
@@ -17,15 +17,16 @@ from hjbjax.feedback.loop import Loop
 from hjbjax.feedback.path import Path
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
+from hjbjax.problem.time_change import has_variable_discount
 from hjbjax.problem.types import Array, Number, State
 
 
 def with_integral(loop: Loop, x0: Any) -> tuple[Loop, Any]:
-    """The loop and its start with z appended to the state; unchanged if the discount is a constant."""
-    if not callable(loop.problem.discount):
+    """The loop and its start with z appended to the state; unchanged with a constant discount and no growth."""
+    if not has_variable_discount(loop.problem):
         return loop, x0
     longer, start = with_entries(loop, x0, (0.0,), _rate, _weight)
-    undiscounted = altered(longer.problem, discount=0.0, discounted=False)
+    undiscounted = altered(longer.problem, discount=0.0, discounted=False, growth=None)
     paid = {"at_horizon": _weighted_value, "push": _weighted_cost}
     seen = {name: getattr(longer, name) for name in paid}
     changed = {name: each and jax.tree_util.Partial(paid[name], each) for name, each in seen.items()}
@@ -33,8 +34,8 @@ def with_integral(loop: Loop, x0: Any) -> tuple[Loop, Any]:
 
 
 def without_integral(path: Path, problem: Problem) -> tuple[Path, Any]:
-    """The path without z, and e^{−∫ β dt} at every output time."""
-    if not callable(problem.discount):
+    """The path without z, and e^{−z} at every output time."""
+    if not has_variable_discount(problem):
         times = path.times - path.times[0]
         return path, np.exp(-np.asarray(problem.discount) * times) if isinstance(times, np.ndarray) else None
     z = path.states[:, -1]
@@ -42,9 +43,10 @@ def without_integral(path: Path, problem: Problem) -> tuple[Path, Any]:
 
 
 def _rate(problem: Problem, arguments: tuple) -> Array:
-    """dz/dt = β."""
-    place = int(problem.time_dependent)
-    return jnp.asarray(problem.discount(*arguments[: place + 1]))
+    """dz/dt = β − g."""
+    where, discount, growth = arguments[: int(problem.time_dependent) + 1], problem.discount, problem.growth
+    rate = jnp.asarray(discount(*where) if callable(discount) else discount)
+    return rate if growth is None else rate - jnp.asarray(growth(*arguments))
 
 
 def _weight(entries: Array) -> Array:

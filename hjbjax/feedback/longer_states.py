@@ -20,7 +20,7 @@ from hjbjax.problem.types import Array, Number, State
 
 BEYOND = 1e30  # an end of the box that an entry of the state never reaches
 PAYMENTS = ("cost", "exit_cost", "terminal_cost", "stopping_cost", "switching_costs", "jump_costs")
-UNPAID = ("drift", "target", "mode_rates", "intensities", "landings")
+UNPAID = ("drift", "target", "growth", "mode_rates", "intensities", "landings")
 SEEN = ("control", "opponent", "surplus", "at_horizon", "switch", "push")  # functions of the loop, of (t, x)
 
 Motion = Callable[[Problem, tuple], Array]  # r, from a problem and the arguments of its functions

@@ -251,7 +251,7 @@ def _is_answer_to(problem: Problem, solution: Solution, path: Path) -> bool:
     played = problem.arguments(x, jnp.asarray(path.controls[0]), d, 0.0)
     alone = problem.state_arguments(x, 0.0)
     for arguments, names in (
-        (played, ("drift", "cost")),
+        (played, ("drift", "cost", "growth")),
         (alone, ("stopping_cost", "running_max", "target", "exit_cost", "terminal_cost", "discount")),
     ):
         for name in names:

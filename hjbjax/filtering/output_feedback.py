@@ -195,6 +195,11 @@ def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
             "simulate_output: got a discount that is a function of the state, wanted a number; make ∫ discount dt a "
             "state z with z(0) = 0, and multiply the costs by exp(−z)"
         )
+    if problem.growth is not None:
+        raise ValueError(
+            "simulate_output: got a problem with growth, wanted one without; make ∫ (discount - growth) dt a state z "
+            "with z(0) = 0, and multiply the costs by exp(−z)"
+        )
     missing = [name for name in ("initial", "update", "estimate") if not callable(getattr(observer, name, None))]
     if missing:
         raise TypeError(

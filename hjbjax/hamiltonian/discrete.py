@@ -2,7 +2,7 @@
 
 At a node, for one action of each player,
 
-    H(u, d) = L(x, u, d) + Σ_o c_o(x, u, d) (V(x + o) − V(x)),
+    H(u, d) = L(x, u, d) + Σ_o c_o(x, u, d) (V(x + o) − V(x)) + g(x, u, d) V(x),
 
 written with one-sided differences, so that only the value is read from memory. With D⁺, D⁻ along an axis the gain of a
 drift component f is [(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻). As a function of u it has kinks where f changes sign
@@ -118,6 +118,8 @@ class DiscreteHamiltonian:
         landed = landed_gaps(self.on, self.value, u, d, self.x) if self.landed is None else self.landed
         for rate, gap in zip(self.on.intensities(u, d, self.x) if landed else [], landed, strict=True):
             total = total + rate * gap
+        for rate in self.on.growth(u, d, self.x):
+            total = total + rate * self.value
         return jnp.broadcast_to(total, grid.shape)
 
     def _diagonal(self, i: int, j: int, entry: Any) -> Any:

@@ -116,12 +116,13 @@ def _part(hamiltonian: DiscreteHamiltonian, player: Player, join: Callable) -> _
         for j in range(count)
     ]
     linear, quadratic = _cost_coefficients(on, player, arguments)
-    # the gain of a jump, or of a change of the mode, is affine in the inputs, like its rate
-    jumps = (on.problem.mode_rates, hamiltonian.gaps), (on.problem.intensities, hamiltonian.landed)
-    for rates, gaps in jumps if player.switches else ():
-        for j in range(count if gaps else 0):
-            found = components.components(player.derivative(on.problem, rates, j), *arguments, dtype=on.dtype)
-            linear[j] = linear[j] + _dot(list(found), gaps or ())
+    # the gain of a jump, of a change of the mode, or of growth is affine in the inputs, like its rate
+    problem, grown = on.problem, (hamiltonian.value,)
+    gains = (problem.mode_rates, hamiltonian.gaps), (problem.intensities, hamiltonian.landed), (problem.growth, grown)
+    for rates, gaps in gains if player.switches else ():
+        for j in range(count if gaps and rates is not None else 0):
+            found = components.components(player.derivative(problem, rates, j), *arguments, dtype=on.dtype)
+            linear[j] = linear[j] + _dot(list(found.reshape(-1)), gaps or ())
     return _Part(hamiltonian, player, linear, quadratic, parts[number], slopes, noise)
 
 

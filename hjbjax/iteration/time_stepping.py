@@ -7,6 +7,7 @@ repeated with shorter steps. Steps end exactly on the kept times; the remaining 
 
 import dataclasses
 import functools
+import itertools
 import math
 from typing import Any
 
@@ -23,6 +24,7 @@ from hjbjax.iteration import bellman, isaacs
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.grid_task import GridTask
 from hjbjax.iteration.time_methods import TABLEAUX, Tableau, TimeMethod, longest_step
+from hjbjax.problem import sets
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Field, Mask, Nodes, Number, Numbers, Scalar, Verdict
@@ -180,6 +182,16 @@ class Seen:
 def stable(on: Discretisation, tableau: Tableau = TABLEAUX[1], share: Numbers = 1.0) -> jax.Array:
     """The longest step at the time of ``on``, see ``longest_step``, of Euler's method by default."""
     return longest_step(largest_rate(on) + _largest_decay(on), on.problem, share, tableau)
+
+
+def fastest_growth(on: Discretisation) -> Scalar:
+    """The largest g − β over nodes and actions at the time of ``on``, at which V may grow with the distance in time."""
+    growth = -jnp.asarray(on.decay, on.dtype)
+    if on.problem.growth is not None:
+        sets_of = (on.problem.controls, on.problem.disturbances)
+        pairs = itertools.product(*(sets.probes(each, on.dtype) for each in sets_of))
+        growth = growth + functools.reduce(jnp.maximum, (on.growth(u, d)[0] for u, d in pairs))
+    return on.grid.layout.largest(jnp.broadcast_to(growth, on.grid.shape))
 
 
 def _largest_decay(on: Discretisation) -> Scalar:

@@ -15,14 +15,14 @@ import numpy as np
 
 from hjbjax.discretisation import correlated_noise, edges, stencil
 from hjbjax.discretisation.discretisation import Chain, Discretisation
-from hjbjax.discretisation.posing import with_mode_axis, without_horizon
+from hjbjax.discretisation.posing import in_time_of_discount, with_mode_axis
 from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.markov_chain import decision_process, laws
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_one_program, cast, is_traced
+from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -258,7 +258,7 @@ def evolve(
     return found
 
 
-@without_horizon
+@in_time_of_discount
 @with_settled_functions
 def transition_arrays(
     problem: Problem, grid: Grid, *, scheme: Chain = Upwind()
@@ -279,7 +279,8 @@ def transition_arrays(
     a problem with rewards, and with ``-costs`` it has the value −V_h of a problem with costs.
 
     If the discount is a function β(x) of the state, the arrays use the time τ with dτ = β(x) dt, in which the discount
-    is one. Drift and costs are divided by β and the noise by √β, so that all states have the same factor.
+    is one. Drift and costs are divided by β and the noise by √β, so that all states have the same factor. With growth
+    g(x, u) of the payments they are divided by β − g.
 
     Args:
       problem: discounted, without disturbances, constraints or switching costs of modes, with K ``Finite`` controls, or
@@ -390,6 +391,7 @@ def _rates_in_program(problem: Problem, grid: Grid, actions: tuple, scheme: Chai
     """The rates under a policy inside a JAX transformation; NaN if they are refused at host level."""
     _refuse_ends(grid)
     _refuse_changes(problem)
+    problem = altered(problem, growth=None)
     u, d, active = decision_process.policy_components(problem, grid, *actions)
     dtype = np.dtype(jnp.result_type(float))
     on, u, d = cast((Discretisation(problem, grid, scheme, dtype, t), u, d), dtype)
@@ -418,6 +420,7 @@ def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, s
     """The rates under a policy; zero on the target and at nodes without an action."""
     checks.check_indices(grid)
     _refuse_changes(problem)
+    problem = altered(problem, growth=None)  # of the payments, not of the motion
     u, d, active = decision_process.policy_components(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
     # the dtype of the policy determines what counts as rounding: float32 is off by 1e-7 at an end

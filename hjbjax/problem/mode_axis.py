@@ -28,7 +28,7 @@ OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_ma
 
 def in_mode(problem: Problem, mode: int) -> Problem:
     """The problem in one mode, without changes of the mode."""
-    names = ("drift", "cost", "noise", *OF_STATE, *PAYMENTS, "discount", "controls")
+    names = ("drift", "cost", "noise", "growth", *OF_STATE, *PAYMENTS, "discount", "controls")
     fixed = {name: _in_mode(each, mode) for name in names if callable(each := getattr(problem, name))}
     jumps = tuple(_jump_in_mode(jump, mode) for jump in problem.jumps)
     pushes = tuple(_push_in_mode(push, mode) for push in problem.pushes)
@@ -58,7 +58,7 @@ def over_modes(problem: Problem, n: int) -> Problem:
     count, place = len(modes.names), int(problem.time_dependent)
     fixed = {
         name: _over(each, count, place)
-        for name in ("cost", *OF_STATE, *OF_JUMPS, "push_costs", "discount", "controls")
+        for name in ("cost", "growth", *OF_STATE, *OF_JUMPS, "push_costs", "discount", "controls")
         if callable(each := getattr(problem, name))
     }
     rates, costs = modes.rates, modes.switching_cost

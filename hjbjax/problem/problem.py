@@ -63,6 +63,10 @@ class Problem:
       discount: β ≥ 0, per unit time; or a function of the state, such as a mortality or a short rate. Then a path is
         discounted by exp(−∫ β(x) dt). Without a horizon it must be positive everywhere; ``march`` takes any sign, and
         functions of (t, x) if ``time_dependent``.
+      growth: g, the rate at which the scale of all payments grows, with the arguments of ``drift``. If the value is
+        proportional to a state K with dK = g K dt, such as the capital of a firm, leave K out of x: the value per unit
+        of K has the discount β − g. Also minus a hazard rate that depends on the control. Without a horizon β − g must
+        be positive for all admissible controls, and the minimum over u is then searched. Default: zero.
       target: a function that is ≤ 0 inside the target, where paths end.
       exit_cost: the cost paid on the target; a number or a function. Default: zero.
       terminal_cost: V at the horizon, for ``march``.
@@ -105,6 +109,7 @@ class Problem:
     disturbances: AdmissibleSet | None = None
     noise: Any = None
     discount: Any = 0.0
+    growth: Any = None
     target: Any = None
     exit_cost: Any = None
     terminal_cost: Any = None
@@ -146,6 +151,7 @@ class Problem:
         disturbances: AdmissibleSet | None = None,
         noise: Callable | Numbers | Sequence | None = None,
         discount: Callable | Number = 0.0,
+        growth: Callable | None = None,
         target: Callable | None = None,
         exit_cost: Callable | Number | None = None,
         terminal_cost: Callable | Number | None = None,
@@ -178,10 +184,10 @@ class Problem:
             raise TypeError(f"Problem.modes: got {modes!r}, wanted hjb.Modes(('low', 'high'), rates=...)")
         jumps, pushes = check_jumps(jumps), check_pushes(pushes)
         # with a running maximum, V ≥ g, there is no integral to discount, so β V − L has no meaning
-        if running_max is not None and (cost is not None or pushes or _is_nonzero(discount)):
+        if running_max is not None and (cost is not None or pushes or growth or _is_nonzero(discount)):
             raise ValueError(
                 "Problem.running_max: the cost is only the running maximum; "
-                "leave out cost, pushes and discount, or put the running cost into a stopping_cost"
+                "leave out cost, pushes and discount, also growth, or put the running cost into a stopping_cost"
             )
         costs = {
             "cost": cost, "exit_cost": exit_cost, "terminal_cost": terminal_cost, "stopping_cost": stopping_cost,
@@ -202,6 +208,7 @@ class Problem:
             "disturbances": disturbances,
             "noise": _noise(noise),
             "discount": discount,
+            "growth": as_partial(growth, "Problem.growth"),
             "target": as_partial(target, "Problem.target"),
             "running_max": as_partial(running_max, "Problem.running_max"),
             "modes": modes,
@@ -213,7 +220,7 @@ class Problem:
             "control_units": words.control_units,
             "inside": words.inside,
             # static, because ``jit`` hides numbers and the certificate must be chosen while compiling
-            "discounted": callable(discount) or (None if is_traced(discount) else bool(discount > 0)),
+            "discounted": growth is not None or known_sign(discount),
             "payoff": payoff,
         }
         for name, value in fields.items():
@@ -253,11 +260,16 @@ def is_discounted(problem: Problem) -> bool | None:
 
     A problem stores it in its structure, so it is known inside ``jit`` even if the number is traced.
     """
-    if callable(problem.discount):  # checked at the nodes
+    if callable(problem.discount) or problem.growth is not None:  # checked at the nodes
         return True
     if is_traced(problem.discount):
         return problem.discounted
     return bool(np.all(np.asarray(problem.discount) > 0))  # a batch has one discount per problem: all must be positive
+
+
+def known_sign(discount: Callable | Number) -> bool | None:
+    """True if a discount is positive, also for a function; None for a traced number."""
+    return callable(discount) or (None if is_traced(discount) else bool(discount > 0))
 
 
 def is_random(problem: Problem) -> bool:

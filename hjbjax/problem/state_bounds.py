@@ -70,7 +70,7 @@ def in_unit_box(problem: Problem, n: int) -> Problem:
     if not callable(problem.controls):
         return problem
     m = count_of(problem, n)
-    named = {name: getattr(problem, name) for name in ("drift", "cost", "noise", "mode_rates", *OF_JUMPS)}
+    named = {name: getattr(problem, name) for name in ("drift", "cost", "noise", "growth", "mode_rates", *OF_JUMPS)}
     changed = {name: _of_v(each, problem) for name, each in named.items() if callable(each)}
     return altered(problem, controls=Box(-np.ones(m), np.ones(m)), **changed)
 

@@ -98,6 +98,7 @@ class SemiLagrangian(Scheme, Paths):
             (bool(grid.modes), "a problem with modes"),
             (problem.landings is not None, "a problem with jumps"),
             (bool(problem.push_steps), "a problem with pushes"),
+            (problem.growth is not None, "a problem with growth"),
             (problem.noise is not None, "a problem with noise: its paths spread"),
             (problem.is_game, "a game: the disturbance would have to answer in the middle of an arc"),
             (problem.running_max is not None, "a running_max: the maximum is evaluated at nodes only"),

@@ -153,7 +153,8 @@ def _other_free_ends(level: Task) -> tuple:
     """``other_ends``; with jumps, without ends at which every value is fixed, because a jump beyond them ends there."""
     if level.problem.landings is None:
         return other_ends(level.problem, level.grid)
-    found, fixed = list(other_ends(level.problem, level.grid)), np.asarray(level.obstacles.fixed)
+    # without a policy the obstacles may be one number for all nodes
+    found, fixed = list(other_ends(level.problem, level.grid)), np.broadcast_to(level.obstacles.fixed, level.grid.shape)
     for axis, (pair, own) in enumerate(zip(found, level.grid.edges, strict=True)):
         if pair:
             ends = (bool(np.all(np.take(fixed, node, axis))) for node in (0, -1))

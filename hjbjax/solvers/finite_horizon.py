@@ -53,7 +53,10 @@ ROUNDING = 1e-12  # relative amount by which a kept time may exceed the horizon
 PROBES = 33  # times at which a given step, and constrained ends, are checked for a time-dependent problem
 FEWEST = 100  # number of steps if no stability limit is known in advance: implicit, or sampled rates
 
+RISE, RISE_GIVEN = 0.02, 0.5  # growth of V in a step: the largest one by default, and in an implicit step that is given
+
 _stable = jax.jit(time_stepping.stable, static_argnames="tableau")
+_fastest_growth = jax.jit(time_stepping.fastest_growth)
 _obstacles = jax.jit(bellman.obstacles)
 
 
@@ -365,9 +368,11 @@ def _prepare(
         found = time_probes.resolution(problem, grid, horizon, dtype)
         time_probes.warn_of_fast_changes(found, horizon, step)
         longest, left = (found.lengths[:, None], found.left) if step is None else (step, 0.0)
-    elif step is None and (looks[0] or not method.limited or problem.killing is not None):
+    elif step is None and (looks[0] or not method.limited or _grows(problem)):
         # rates found during the march do not limit its first steps, and only a constant discount is integrated exactly
         longest = horizon / FEWEST
+    if _grows(problem):
+        longest = _within_growth(on, horizon, method, step, longest)
     obstacles = None if moving or not policy else _obstacles(on)
     return March(
         on, method, obstacles, None if moving and method.limited else limit, jnp.asarray(longest, dtype),
@@ -376,6 +381,29 @@ def _prepare(
         checks_cut=_checks_cut(on) and policy and mesh is None, bare=not policy,
         missed=jnp.asarray(left, dtype), mesh=mesh,
     )  # fmt: skip
+
+
+def _grows(problem: Problem) -> bool:
+    """True if V may grow with the distance in time: its discount is a function, or its payments have a growth rate."""
+    return problem.killing is not None or problem.growth is not None
+
+
+def _within_growth(
+    on: Discretisation, horizon: float, method: TimeMethod, step: float | None, longest: Array | float
+) -> Array | float:
+    """The longest step, limited by the growth of V; refuse a given implicit step that is too long for it."""
+    moments = np.linspace(horizon, 0.0, PROBES) if on.problem.time_dependent else [horizon]
+    growth = max(float(_fastest_growth(on.at(jnp.asarray(t, on.dtype)))) for t in moments)
+    if growth <= 0:
+        return longest
+    if step is None:
+        return np.minimum(longest, RISE / growth)
+    if not method.limited and step * growth > RISE_GIVEN:
+        raise ValueError(
+            f"march: step = {step:g} is too long for a discount of {-growth:.6g} per unit time; wanted at most "
+            f"{RISE_GIVEN / growth:.3g}.\nV grows by the factor 1/(1 + step · discount) per implicit step; remove step"
+        )
+    return longest
 
 
 def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool, bool]:
@@ -476,14 +504,15 @@ def _march_traced(
 
 def _is_stable(on: Discretisation, method: TimeMethod, horizon: float, step: float) -> jax.Array:
     """True if steps of this length are stable at the checked times, as far as rates are known."""
-    if not method.limited:
+    on, moving = jax.lax.stop_gradient(on), on.problem.time_dependent
+    if not method.limited and not _grows(on.problem):
         return jnp.ones((), bool)
-    on = jax.lax.stop_gradient(on)
-    share = 1 / method.tableau.euler
 
     def limit(t: Scalar | float) -> Scalar:
-        return time_stepping.stable(on.at(t), method.tableau, share)
+        if method.limited:
+            return time_stepping.stable(on.at(t), method.tableau, 1 / method.tableau.euler)
+        growth = time_stepping.fastest_growth(on.at(t))
+        return jnp.where(growth > 0, RISE_GIVEN / jnp.where(growth > 0, growth, 1), jnp.inf)
 
-    moving = on.problem.time_dependent
     limits = jax.lax.map(limit, jnp.linspace(horizon, 0.0, PROBES, dtype=on.dtype)) if moving else limit(horizon)
     return step <= jnp.min(limits) * (1 + 1e-6)

@@ -234,7 +234,7 @@ def _limit(task: March, on: Discretisation) -> Number | None:
         return task.limit
     tableau, beta = task.method.tableau, float(task.problem.discount)
     fine, coarse = task.grid, on.grid
-    different = task.problem.target is not None or task.problem.killing is not None
+    different = any(getattr(task.problem, name) is not None for name in ("target", "killing", "growth"))
     if different or any(a == b for a, b in zip(fine.shape, coarse.shape, strict=True)):
         return _stable(on, tableau, jnp.asarray(task.method.courant, on.dtype))
     ratio, limit, share = nested_grids.ratio_of(fine, coarse), float(task.limit), float(task.method.courant)

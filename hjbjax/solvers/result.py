@@ -244,6 +244,9 @@ def _enclosure(task: Task, state: State, assumptions: Assumptions) -> Any:
     if any(each.programmed for each in task.on.players.both) or (traced and exact.needs_convexity(task.on)):
         bound = _widened(task, state.value, bound, kind)
         bound = bound if traced else jax.device_get(bound)
+    if task.problem.growth is not None:  # a constant shift of V changes the residual by at least the discount
+        xp: Any = jnp if traced else np
+        bound = dataclasses.replace(bound, below=xp.minimum(bound.below, 0), above=xp.maximum(bound.above, 0))
     return certificates.enclosure(kind, bound, discount)
 
 

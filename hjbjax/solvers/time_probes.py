@@ -27,7 +27,7 @@ from hjbjax.solution.status import warn
 PARTS = 100  # of the horizon, each at least one step
 CUTS = (1, 2, 4, 8, 16, 32, 64)  # numbers of steps per part
 PLACES = 6  # states, each with its own actions
-INTEGRATED = ("drift", "cost", "noise", "killing")  # the last is a function of the state
+INTEGRATED = ("drift", "cost", "noise", "growth", "killing")  # the last is a function of the state
 INSIDE = 2  # samples inside the shortest steps, at random, since an oscillation could fit between regular samples
 INTEGRAL, LEVEL = 2e-3, 2e-2
 WARNS = 2e-2  # relative error of the integral with the shortest steps

@@ -23,7 +23,7 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import indices, jaxprs
 from hjbjax.tracing.operations import Operations, operations
 
-OF_ACTION = ("drift", "cost", "noise", "mode_rates", "intensities", "landings")
+OF_ACTION = ("drift", "cost", "noise", "growth", "mode_rates", "intensities", "landings")
 STATE_COSTS = ("exit_cost", "terminal_cost", "stopping_cost", "running_max")
 RATES = ("discount", "killing")
 USERS_NAMES = {
@@ -142,7 +142,7 @@ def of_one_state(problem: Problem, n: int, meaning: str) -> None:
     with own_settings(x64=True):
         expect("drift", f"({n},)", lambda shape: shape == (n,))
         expect("noise", f"(), ({n},) or ({n}, k)", lambda shape: shape[:1] in ((), (n,)) and len(shape) <= 2)
-        for name in ("cost", "target", *STATE_COSTS, *RATES):
+        for name in ("cost", "growth", "target", *STATE_COSTS, *RATES):
             expect(name, "()", lambda shape: shape == ())
 
 

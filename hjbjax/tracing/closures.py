@@ -51,7 +51,7 @@ from hjbjax.tracing.outside import (
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-OF_ACTION = ("drift", "cost", "noise", "mode_rates", "intensities", "landings", "jump_costs")
+OF_ACTION = ("drift", "cost", "noise", "growth", "mode_rates", "intensities", "landings", "jump_costs")
 OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max", "switching_costs", "push_costs")
 RATES = ("discount", "killing")  # numbers, or functions of the state
 

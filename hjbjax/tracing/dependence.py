@@ -136,8 +136,8 @@ class Influence:
     """Dependence of drift, cost and noise on both players' inputs, the control's first, then the disturbance's.
 
     Attributes:
-      drift, cost, noise, switching, landing: the dependences; the last two of the rates of jumps, including changes of
-        the mode, and of the states after the jumps.
+      drift, cost, noise, switching, landing: the dependences; the last two of the rates of jumps, of changes of the
+        mode and of the growth, and of the states after the jumps.
       control, disturbance: the inputs of each player.
     """
 
@@ -177,7 +177,8 @@ def influence(problem: Problem, n: int, dtype: DType) -> Influence:
     def of(function: object) -> Dependence:
         return dependence(function, *arguments, dtype=dtype) if callable(function) else Dependence((CONSTANT,))
 
-    rates = [of(each) for each in (problem.mode_rates, problem.intensities) if each is not None]
+    each = (problem.mode_rates, problem.intensities, problem.growth)
+    rates = [of(function) for function in each if function is not None]
     switching = Dependence(
         sum((each.entries for each in rates), start=()) or (CONSTANT,), sum((each.operations for each in rates), NONE)
     )

@@ -274,6 +274,8 @@ def _faults(on: Discretisation, x: list, u: list, d: list | None) -> dict[str, j
     bad = {"drift": faulty(on.drift(u, d, x))}
     if problem.cost is not None:
         bad["cost"] = faulty([on.running_cost(u, d, x)])
+    if rates := on.growth(u, d, x):
+        bad["growth"] = faulty(rates)
     a = on.diffusion(u, d, x)
     if a:
         bad["noise"] = faulty(a.values())

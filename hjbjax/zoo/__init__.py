@@ -11,6 +11,7 @@ under the names that the command line uses.
     (1, (81,), ())
 """
 
+from hjbjax.zoo.constrained_firm import ConstrainedFirm, Refinancing, liquidation, refinancing
 from hjbjax.zoo.dividends import Reserve, dividends, dividends_exact
 from hjbjax.zoo.entry import Entry
 from hjbjax.zoo.finance import Merton, Wealth, merton, merton_exact, merton_wealth, merton_wealth_exact
@@ -199,6 +200,14 @@ _ENTRIES = (
         duration=10.0,
     ),
     Entry(
+        "liquidation",
+        "investment and payout of a firm that is liquidated without cash",
+        liquidation,
+        # a third of the payout boundary
+        start=(0.07,),
+        duration=10.0,
+    ),
+    Entry(
         "moon-landing",
         "land a rocket with the least fuel: when to start the engine",
         moon_landing,
@@ -221,6 +230,7 @@ __all__ = [
     "BangBang",
     "Boat",
     "CarWithTrailers",
+    "ConstrainedFirm",
     "DoubleIntegrator",
     "Dubins",
     "Entry",
@@ -235,6 +245,7 @@ __all__ = [
     "PlanarQuadrotor",
     "Pomet",
     "Ramsey",
+    "Refinancing",
     "Reserve",
     "Saving",
     "SingleIntegrator",
@@ -264,6 +275,7 @@ __all__ = [
     "growth_exact",
     "leland",
     "leland_exact",
+    "liquidation",
     "lq_game",
     "lq_game_exact",
     "manipulator",
@@ -278,6 +290,7 @@ __all__ = [
     "pendulum_near_upright",
     "perpetual_put",
     "perpetual_put_exact",
+    "refinancing",
     "saving",
     "smooth",
     "smooth_exact",

@@ -40,7 +40,7 @@ def solve(axes, modes, actions, drift, cost, *, noise=None, rates=None, switchin
 
     ``drift(x, u, i)``, ``cost``, ``noise`` (σ per axis), ``rates`` (k, k) and ``switching`` (k, k) are plain functions;
     ``target(x, i)`` is true where the run ends and pays ``exit_cost(x, i)``. A jump is a triple of ``rate(x, u, i)``,
-    ``landing(x, u, i)`` and ``cost(x, u, i)``.
+    ``landing(x, u, i)`` and ``cost(x, u, i)``. The discount is a number or a function of (x, u, i).
     """
     shape = tuple(map(len, axes))
     nodes = [(i, *node) for i in range(modes) for node in itertools.product(*map(range, shape))]
@@ -68,7 +68,7 @@ def solve(axes, modes, actions, drift, cost, *, noise=None, rates=None, switchin
                 row[k] += rate(x, u, i)
                 for there, part in landing_rows(axes, landing(x, u, i), lambda node: number[(i, *node)], rate(x, u, i)):  # noqa: B023
                     row[there] -= part
-            row[k] += discount
+            row[k] += discount(x, u, i) if callable(discount) else discount
             rows.append((row, paid, name))
         if switching is not None:
             for j, paid in enumerate(switching(x)[i]):

@@ -145,6 +145,18 @@ def test_the_generator_has_the_rates_of_the_jumps():
     assert np.allclose(generator, expected)
 
 
+def test_a_value_without_a_policy_has_a_box_error():
+    problem = hjb.Problem(
+        lambda x, u: -x, lambda x, u: x @ x, noise=0.4, discount=1.0, jumps=[hjb.Jump(0.5, lambda x, u: x / 2)]
+    )
+    grid = hjb.Grid([-1.0], [1.0], (11,))
+    value, policy = (
+        hjb.solve(problem, grid, scheme=CHAIN, tol=1e-6, method=hjb.ValueIteration(policy=each))
+        for each in (False, True)
+    )
+    assert np.allclose(value.box_error, policy.box_error, atol=1e-5)
+
+
 def test_a_periodic_jump_wraps():
     problem = hjb.Problem(lambda x, u: 0 * x, jumps=[hjb.Jump(1.0, lambda x, u: x - 2.5)])
     generator = hjb.chain.generator(problem, hjb.Grid([0.0], [4.0], (4,), (True,))).toarray()

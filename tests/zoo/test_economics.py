@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import hjbjax as hjb
 from hjbjax import zoo
@@ -143,3 +145,68 @@ def test_owners_default_at_the_boundary_of_leland(numbers):
     solution = hjb.solve(problem, grid)
     np.testing.assert_allclose(solution.value, exact_at_nodes(zoo.leland_exact(**numbers), grid), atol=1e-3)
     assert float(np.exp(solution.free_boundary()[0])) == pytest.approx(float(firm.boundary), rel=1e-3)
+
+
+def shot(firm, barrier):
+    """p and p′ of a firm that pays out above the barrier, on the way down to zero cash, by SciPy; functions of w."""
+    r, delta, mu, theta = firm.interest, firm.depreciation, firm.productivity, firm.adjustment
+
+    def rest(w, p, slope):
+        """The equation without the term of the noise, at the best investment."""
+        i = (p / slope - w - 1) / theta
+        flow = (r - firm.carrying) * w + mu - i - theta * i**2 / 2
+        return (i - delta) * (p - w * slope) + flow * slope - r * p
+
+    def ode(w, y):
+        return [y[1], -2 / firm.volatility**2 * rest(w, *y)]
+
+    least = brentq(lambda q: rest(barrier, barrier + q, 1.0), 0.5, 1 + theta * float(firm.first_best))
+    return solve_ivp(ode, (barrier, 0.0), [barrier + least, 1.0], rtol=1e-11, atol=1e-13, dense_output=True).sol
+
+
+def test_a_firm_is_liquidated_as_in_bolton_chen_and_wang():
+    problem, grid = zoo.liquidation()
+    found, firm = hjb.solve(problem, grid), zoo.ConstrainedFirm()
+    assert abs(float(firm.first_best) - 0.151) < 5e-4  # as published, like all numbers with two digits
+    assert abs(1 + firm.adjustment * float(firm.first_best) - 1.23) < 5e-3
+    barrier = brentq(lambda w: shot(firm, w)(0.0)[0] - firm.liquidation, 0.15, 0.28)
+    exact, w = shot(firm, barrier), grid.axis(0)
+    kept = np.minimum(w, barrier)
+    assert np.max(np.abs(found.value - (exact(kept)[0] + w - kept))) <= 2e-3
+    (paid,) = found.free_boundary()
+    assert abs(barrier - 0.22) < 5e-3
+    assert abs(paid - barrier) <= grid.spacing(0)
+    assert abs(exact(0.0)[1] - 30) < 0.5
+    assert abs(found.costate_at([0.0])[0] - exact(0.0)[1]) <= 0.2
+    assert found.policy[1, 0] < -0.6
+    assert abs(found.control_at([paid])[0] - 0.106) < 1e-3
+
+
+@pytest.mark.slow
+def test_a_firm_issues_equity_as_in_bolton_chen_and_wang():
+    firm, problem, grid = zoo.ConstrainedFirm(), *zoo.refinancing()
+    found, w = hjb.solve(problem, grid), grid.axis(0)
+
+    def issued(barrier):
+        """p on a fine grid of cash, and the best issue."""
+        fine = np.linspace(0.0, barrier, 4001)
+        p = shot(firm, barrier)(fine)[0]
+        net = p - 0.01 - 1.06 * fine
+        return p, net.max() - p[0], fine[np.argmax(net)]
+
+    barrier = brentq(lambda b: issued(b)[1], 0.16, 0.22)
+    p, _, raised = issued(barrier)
+    kept = np.minimum(w, barrier)
+    exact = np.interp(kept, np.linspace(0.0, barrier, 4001), p) + w - kept
+    assert np.max(np.abs(found.value[0] - exact)) <= 1e-4
+    paying, issuing = found.in_mode("operating").pushing[:, 0], found.in_mode("issuing").pushing[:, 1]
+    assert abs(w[np.flatnonzero(paying)[0]] - barrier) <= 1.5 * grid.spacing(0)
+    assert abs(w[np.flatnonzero(issuing)[-1] + 1] - raised) <= 1.5 * grid.spacing(0)
+    assert abs(barrier - 0.19) < 5e-3
+    assert abs(raised - 0.06) < 5e-3
+    assert abs(found.costate_at([0.0], mode="operating")[0] - 1.7) < 0.05
+    assert abs(found.control_at([barrier], mode="operating")[0] - 0.11) < 2e-3
+    assert found.switching[0, 0] == 1  # without cash it issues at once
+    path = hjb.simulate(problem, found, [0.02], 3.0, mode="operating", key=3)
+    assert path.status.name == "DURATION"
+    assert np.all(path.states[:, 0] <= barrier + grid.spacing(0))

@@ -27,6 +27,7 @@ from hjbjax.cli.command_line import text_of
 from hjbjax.feedback.path import Path as Trajectory
 from hjbjax.plotting.slices import feedback
 from hjbjax.problem.labels import COST
+from hjbjax.problem.mode_axis import without_modes
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, SolveError, Status
@@ -136,23 +137,24 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
 
 def _figures(problem: Problem, solution: Solution, entry: Entry) -> tuple[list[tuple[str, Figure]], Trajectory | None]:
     """Captions and figures, and the path: value and closed loop in one figure if there is a path, then the feedback."""
-    start = entry.initial_state(solution.grid.ndim)
+    states = len(solution.grid.state_axes)
+    start = entry.initial_state(states)
     fixed = dict(enumerate(start[2:], 2))  # cut all axes from the third on at the start of the path
     jumps = run_folder.is_bang_bang(problem, solution)
     finish = None if entry.finish is None else entry.finish()
     path = None
     if solution.status == Status.CONVERGED:
-        path = run_folder.closed_path(problem, solution, start, entry.duration, jumps, finish)
+        path = run_folder.closed_path(problem, solution, start, entry.duration, jumps, finish, entry.mode)
     drawn: list[tuple[str, Figure]] = []
-    if path is None or solution.grid.ndim == 1:  # the figure of a loop with one state does not show the value
-        value = plotting.value(solution, ax=run_folder.axes(), fixed=fixed, target=problem.target)
-        drawn.append(("the value", run_folder.with_curve(value, solution, fixed, jumps).figure))
+    if path is None or states == 1 or solution.grid.modes:  # otherwise the figure of the loop shows the value
+        drawn.append(("the value", run_folder.plot_values(problem, solution, fixed, jumps)))
     if path is not None:
-        figure = run_folder.figure_of(plotting.maps.closed_loop_size(solution.grid))
-        plotting.closed_loop(solution, path, fixed=fixed, target=problem.target, figure=figure)
-        drawn.append(("the closed loop" if solution.grid.ndim == 1 else "the value, and the closed loop on it", figure))
+        figure = run_folder.figure_of(plotting.maps.closed_loop_size(without_modes(solution.grid)))
+        target = run_folder.target_in(problem, entry.mode)
+        plotting.closed_loop(solution, path, fixed=fixed, target=target, figure=figure)
+        drawn.append(("the closed loop" if states == 1 else "the value, and the closed loop on it", figure))
     if solution.policy.shape[-1] and not _is_constant(solution, fixed):
-        drawn.append(("the feedback", run_folder.plot_policies(solution, fixed, jumps)))
+        drawn.append(("the feedback", run_folder.plot_policies(problem, solution, fixed, jumps)))
     return drawn, path
 
 

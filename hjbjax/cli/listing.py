@@ -9,7 +9,9 @@ import numpy as np
 
 from hjbjax import zoo
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pushes import Push
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Simplex
 from hjbjax.zoo.entry import Entry
 
@@ -21,10 +23,11 @@ def overview() -> Iterator[str]:
     """Two lines per problem: name and summary; states with units, grid, and a note if an exact answer is known."""
     width = max(map(len, zoo.catalogue))
     for entry in zoo.catalogue.values():
-        _, grid = entry.build()
+        problem, grid = entry.build()
         yield f"{entry.name:<{width}}  {entry.summary}"
         answer = "" if entry.exact is None else "; exact answer known"
-        yield f"{'':<{width}}  {', '.join(_with_units(grid.names, grid.units))}; {_sizes(grid)} nodes{answer}"
+        modes = "" if problem.modes is None else f" in each of the modes {', '.join(problem.modes.names)}"
+        yield f"{'':<{width}}  {', '.join(_with_units(grid.names, grid.units))}; {_sizes(grid)} nodes{modes}{answer}"
 
 
 def details(entry: Entry) -> Iterator[str]:
@@ -52,12 +55,28 @@ def _facts(entry: Entry, problem: Problem, grid: Grid) -> Iterator[tuple[str, st
     ends = zip(_with_units(grid.names, grid.units), grid.lo, grid.hi, grid.periodic, strict=True)
     states = (f"{name} from {lo:.4g} to {hi:.4g}{', periodic' * bool(round_)}" for name, lo, hi, round_ in ends)
     yield "states", "; ".join(states)
+    if problem.modes is not None:
+        yield "modes", f"{', '.join(problem.modes.names)}; {_changes(problem.modes)}"
+    if problem.pushes:
+        yield "pushes", ", ".join(_direction(push, grid) for push in problem.pushes)
     yield "controls", _actions(problem.controls, problem.control_names, problem.control_units)
     if problem.disturbances is not None:
         yield "disturbances", _actions(problem.disturbances, (), ())
     yield "grid", f"{_sizes(grid)} nodes"
     yield "ends by", "a target" if problem.target is not None else "nothing: the horizon is infinite"
     yield "exact answer", "none is known" if entry.exact is None else "known, and compared with"
+
+
+def _changes(modes: Modes) -> str:
+    """How the mode changes, in words."""
+    words = {"at random": modes.rates, "by choice": modes.switching_cost}
+    return "changed " + " and ".join(word for word, table in words.items() if table is not None)
+
+
+def _direction(push: Push, grid: Grid) -> str:
+    """The direction of a push in words."""
+    axis, step = push.step
+    return f"{grid.names[axis]} {'up' if step > 0 else 'down'}"
 
 
 def _actions(admissible: AdmissibleSet | None, names: tuple[str, ...], units: tuple[str, ...]) -> str:

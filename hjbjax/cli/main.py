@@ -368,12 +368,12 @@ def _write(
 
     made: list[str] = []
     path, published = None, False
-    start = entry.initial_state(solution.grid.ndim)
+    start = entry.initial_state(len(solution.grid.state_axes))
     finish = None if entry.finish is None else entry.finish(**parameters)
+    loop: dict[str, Any] = {"start": start, "mode": entry.mode, "duration": entry.duration, "finish": finish}
     try:
         try:
-            pictures = run_folder.make(problem, solution, staging, start=start, duration=entry.duration, finish=finish)
-            for file, drawn in pictures:  # a generator: each file is complete before the next one starts
+            for file, drawn in run_folder.make(problem, solution, staging, **loop):  # each file is complete on return
                 made.append(file)
                 path = drawn
         finally:  # keep the complete files

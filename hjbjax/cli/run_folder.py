@@ -17,7 +17,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
@@ -32,7 +32,8 @@ from hjbjax.plotting.slices import at_states
 from hjbjax.plotting.style import NARROW, save_figure
 from hjbjax.problem import streams
 from hjbjax.problem.labels import COST
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.mode_axis import in_mode, without_modes
+from hjbjax.problem.problem import Problem, is_random
 from hjbjax.problem.sets import Ball, Box, Simplex
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, Status
@@ -180,11 +181,13 @@ def make(
     start: Sequence[float],
     duration: float,
     finish: tuple[Problem, Feedback] | None = None,
+    mode: str | None = None,
 ) -> Iterator[tuple[str, Trajectory | None]]:
     """Write the files one by one; yield the name of each file, and the trajectory with the last one.
 
     An interrupted solve is saved but not plotted, and a solve that has not converged has no trajectory. ``finish`` is
-    the problem and the feedback of the final phase inside the target, if the exit cost is the cost of that phase.
+    the problem and the feedback of the final phase inside the target, if the exit cost is the cost of that phase, and
+    ``mode`` the mode in which the trajectory starts.
 
     Raises:
       OSError: a file cannot be written.
@@ -197,18 +200,17 @@ def make(
     fixed = dict(enumerate(start[2:], 2))  # cut all axes from the third on at the start of the trajectory
     jumps = is_bang_bang(problem, solution)
     # figures without pyplot, which is slow to import and would keep them
-    value = plotting.value(solution, ax=axes(), fixed=fixed, target=problem.target)
-    with_curve(value, solution, fixed, jumps).save(folder / "value.png", dpi=DPI)
+    save_figure(plot_values(problem, solution, fixed, jumps), folder / "value.png", dpi=DPI)
     yield "value.png", None
     if problem.controls is not None:
-        save_figure(plot_policies(solution, fixed, jumps), folder / "policy.png", dpi=DPI)
+        save_figure(plot_policies(problem, solution, fixed, jumps), folder / "policy.png", dpi=DPI)
         yield "policy.png", None
     path = None
     if solution.status == Status.CONVERGED:  # a closed loop with an unfinished feedback would be misleading
-        path = closed_path(problem, solution, start, duration, jumps, finish)
+        path = closed_path(problem, solution, start, duration, jumps, finish, mode)
     if path is not None:
-        figure = figure_of(closed_loop_size(solution.grid))
-        loop = plotting.closed_loop(solution, path, fixed=fixed, target=problem.target, figure=figure)
+        figure = figure_of(closed_loop_size(without_modes(solution.grid)))
+        loop = plotting.closed_loop(solution, path, fixed=fixed, target=target_in(problem, mode), figure=figure)
         loop.save(folder / "trajectory.png", dpi=DPI)
         yield "trajectory.png", path
 
@@ -218,11 +220,6 @@ def figure_of(size: tuple[float, float]) -> "Figure":
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, layout="constrained")
-
-
-def axes() -> "Axes":
-    """Axes on a new figure outside pyplot's registry."""
-    return plotting.styled(figure_of(NARROW).add_subplot())
 
 
 def is_bang_bang(problem: Problem, solution: Solution) -> bool:
@@ -259,6 +256,7 @@ def closed_path(
     duration: float,
     jumps: bool,
     finish: tuple[Problem, Feedback] | None,
+    mode: str | None = None,
 ) -> Trajectory | None:
     """The path of the closed loop, followed by the final phase inside the target.
 
@@ -266,7 +264,9 @@ def closed_path(
     every state. A control that jumps is sampled, because an adaptive integrator is very slow along a switching curve.
     """
     # a fixed key, so that the same path is drawn every time
-    options: dict[str, Any] = {} if problem.noise is None else {"key": 0}
+    options: dict[str, Any] = {"key": 0} if is_random(problem) else {}
+    if mode is not None:
+        options["mode"] = mode
     if jumps:
         options["hold"] = duration / SAMPLES
     sharp = jumps or _is_direction(problem, solution)
@@ -285,17 +285,59 @@ def closed_path(
         return None
 
 
-def plot_policies(solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
-    """One plot per input, side by side."""
-    count = solution.policy.shape[-1]
-    figure = figure_of((NARROW[0] * max(1, count), NARROW[1]))
-    if count == 0:
-        figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")
-        return figure
-    for input, ax in enumerate(figure.subplots(1, count, squeeze=False)[0]):
-        drawn = plotting.policy(solution, input=input, fixed=fixed, ax=plotting.styled(ax))
-        with_curve(drawn, solution, fixed, jumps, input)
+class _Part(NamedTuple):
+    """The solution of one plot: of all modes over one state, otherwise of one mode."""
+
+    title: str
+    solution: Solution
+    target: Callable | None
+
+
+def _parts(problem: Problem, solution: Solution) -> list[_Part]:
+    """The solutions to plot side by side."""
+    modes = solution.grid.modes
+    if not modes:
+        return [_Part("", solution, problem.target)]
+    if len(solution.grid.state_axes) == 1:  # the plot has one line per mode
+        return [_Part("", solution, None)]
+    return [_Part(f"mode {name}", solution.in_mode(name), target_in(problem, name)) for name in modes]
+
+
+def target_in(problem: Problem, mode: str | None) -> Callable | None:
+    """The target as a function of the state, in the given mode of a problem with modes."""
+    return problem.target if problem.modes is None else in_mode(problem, problem.modes.number(mode or 0)).target
+
+
+def plot_values(problem: Problem, solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
+    """The value; with modes over two states one plot per mode, side by side."""
+    parts = _parts(problem, solution)
+    figure, axes_of_parts = _panels([part.title for part in parts])
+    for ax, part in zip(axes_of_parts, parts, strict=True):
+        drawn = plotting.value(part.solution, ax=ax, fixed=fixed, target=part.target)
+        with_curve(drawn, part.solution, fixed, jumps)
+        ax.set_title(part.title)
     return figure
+
+
+def plot_policies(problem: Problem, solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
+    """One plot per input and, over two states, per mode, side by side."""
+    inputs = [(part, input) for input in range(solution.policy.shape[-1]) for part in _parts(problem, solution)]
+    figure, axes_of_inputs = _panels([part.title for part, _ in inputs])
+    if not inputs:
+        figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")
+    for ax, (part, input) in zip(axes_of_inputs, inputs, strict=True):
+        drawn = plotting.policy(part.solution, input=input, fixed=fixed, ax=ax)
+        with_curve(drawn, part.solution, fixed, jumps, input)
+        ax.set_title(part.title)
+    return figure
+
+
+def _panels(titles: Sequence[str]) -> tuple["Figure", list["Axes"]]:
+    """A figure with one plot per title, side by side."""
+    figure = figure_of((NARROW[0] * max(1, len(titles)), NARROW[1]))
+    if not titles:
+        return figure, []
+    return figure, [plotting.styled(ax) for ax in figure.subplots(1, len(titles), squeeze=False)[0]]
 
 
 def with_curve(
@@ -303,7 +345,7 @@ def with_curve(
 ) -> plotting.Picture:
     """Add the switching curve to a plot, if there is one."""
     # enumerated controls have no sign, and over one axis the jump is visible in the line
-    if jumps and not solution.discrete and solution.grid.ndim > 1:
+    if jumps and not solution.discrete and len(solution.grid.state_axes) > 1:
         with contextlib.suppress(ValueError):  # the control does not change sign
             plotting.switching_curve(solution, input=input, fixed=fixed, ax=picture.ax)
     return picture
@@ -352,6 +394,7 @@ def json_report(solution: Solution, path: Trajectory | None, files: Sequence[Pat
     answer = {
         **about,
         "shape": solution.grid.shape,
+        "modes": solution.grid.modes,
         "status": solution.status.name,
         "message": solution.message or solution.status.message,
         **{name: getattr(solution, name) for name in numbers},

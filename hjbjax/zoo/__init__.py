@@ -208,6 +208,32 @@ _ENTRIES = (
         duration=10.0,
     ),
     Entry(
+        "refinancing",
+        "investment, payout and equity issues of a firm",
+        refinancing,
+        # with little cash, so an issue is likely
+        start=(0.03,),
+        duration=10.0,
+        mode="operating",
+    ),
+    Entry(
+        "saving",
+        "consume and save with two incomes that alternate at random",
+        saving,
+        start=(0.5,),
+        duration=20.0,
+        mode="poor",
+    ),
+    Entry(
+        "thermostat",
+        "hold a temperature with a heater whose switching costs something",
+        thermostat,
+        # colder than wanted, so the heater is switched on at once
+        start=(17.0,),
+        duration=10.0,
+        mode="off",
+    ),
+    Entry(
         "moon-landing",
         "land a rocket with the least fuel: when to start the engine",
         moon_landing,

@@ -22,6 +22,7 @@ class Entry:
         the keywords of ``build`` except ``shape``. ``None`` if no exact value is known.
       start: the initial state of the trajectory in the gallery.
       duration: the length of this trajectory, in units of time.
+      mode: the mode in which it starts, for a problem with modes.
       finish: ``finish(**parameters) -> (problem, feedback)`` with the keywords of ``exact``, for a problem whose target
         prescribes the cost of a final phase. It returns the problem of the final phase, which ends where the full
         problem ends, and its exact feedback. ``None`` if there is no final phase.
@@ -43,6 +44,7 @@ class Entry:
     duration: float = 5.0
     finish: Callable[..., tuple[Problem, Feedback]] | None = None
     kinked: bool = False
+    mode: str | None = None
 
     @property
     def parameters(self) -> dict[str, Any]:  # numbers, tuples of numbers, booleans or None

@@ -11,6 +11,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
+from hjbjax.problem.mode_axis import in_mode
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.sets import Ball, Finite
 from hjbjax.tracing import components
@@ -21,7 +22,8 @@ FLOATS = [
     (entry, name) for entry in ENTRIES for name, default in entry.parameters.items() if isinstance(default, float)
 ]
 
-OTHER = {("liquidation", "productivity"): 0.9}  # the factor of another value, because 1.25 makes the value infinite
+# factors of other values, because 1.25 makes the value infinite
+OTHER = {("liquidation", "productivity"): 0.9, ("refinancing", "productivity"): 0.9}
 
 
 def name_of(value):
@@ -35,6 +37,12 @@ def some_input(admissible):
     if isinstance(admissible, Ball):
         return jnp.full(admissible.dim, 0.3 * admissible.radius)
     return admissible.points[0] if isinstance(admissible, Finite) else 0.7 * admissible.hi + 0.3 * admissible.lo
+
+
+def built(entry, **parameters):
+    """The problem with costs, in its first mode if there are modes, and the grid."""
+    problem, grid = entry.build(**parameters)
+    return costs_of(problem if problem.modes is None else in_mode(problem, 0)), grid
 
 
 def arguments(problem, x):
@@ -56,8 +64,7 @@ def test_the_catalogue_has_the_problems_under_hyphenated_names():
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=name_of)
 def test_functions_have_the_promised_shapes(entry):
-    problem, grid = entry.build()
-    problem = costs_of(problem)
+    problem, grid = built(entry)
     x = jnp.asarray(entry.initial_state(grid.ndim))
     assert np.all(x >= grid.lo)
     assert np.all(x <= grid.hi)
@@ -76,8 +83,7 @@ def test_functions_have_the_promised_shapes(entry):
 @pytest.mark.parametrize("entry", ENTRIES, ids=name_of)
 def test_functions_are_evaluated_by_components(entry, sample_state):
     # FallbackWarning is an error here, so this says that every primitive of the zoo has a component rule.
-    problem, grid = entry.build()
-    problem = costs_of(problem)
+    problem, grid = built(entry)
     states = np.stack([np.asarray(sample_state(grid, seed)) for seed in range(3)])
     functions = [(problem.drift, True), (problem.cost, True), (problem.target, False), (problem.exit_cost, False)]
 
@@ -118,8 +124,7 @@ def test_another_parameter_is_the_same_structure(entry, name):
 @pytest.mark.parametrize(("entry", "name"), FLOATS, ids=name_of)
 def test_a_parameter_may_be_a_tracer(entry, name, sample_state):
     def evaluate(parameter):
-        problem, grid = entry.build(**{name: parameter})
-        problem = costs_of(problem)
+        problem, grid = built(entry, **{name: parameter})
         inputs = arguments(problem, x)
         values = [problem.drift(*inputs), problem.diffusion(*inputs[:2]), problem.discount]
         values += [problem.cost(*inputs)] if problem.cost is not None else []

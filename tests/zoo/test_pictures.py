@@ -6,6 +6,7 @@ import pytest
 from pictures import hatched_nodes
 from pictures import pictures as plotting
 
+import hjbjax as hjb
 from hjbjax import Grid, Problem, Solution, Status, simulate, zoo
 from hjbjax.cli import run_folder
 from hjbjax.feedback.path import PathStatus, join_paths
@@ -109,3 +110,35 @@ def test_joined_paths_discount_what_comes_later():
     assert whole.controls.shape == (8, 0)
     assert whole.reached is None
     assert "from there ran for the whole duration at t = 4" in whole.message
+
+
+def test_two_states_with_modes_have_one_panel_per_mode():
+    problem = Problem(
+        lambda x, u, mode: u - x, lambda x, u, mode: (1.0 + mode) * x @ x, hjb.Box([-1.0, -1.0], [1.0, 1.0]),
+        discount=1.0, modes=hjb.Modes(("calm", "wild"), rates=[[0, 1], [1, 0]]), target=lambda x, mode: x @ x - 0.1,
+    )  # fmt: skip
+    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (11, 11))
+    solution = hjb.solve(problem, grid, scheme=hjb.Upwind(), tol=1e-3)
+    figure = run_folder.plot_values(problem, solution, {}, False)
+    titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
+    assert titles == ["mode calm", "mode wild"]
+    figure = run_folder.plot_policies(problem, solution, {}, False)
+    titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
+    assert titles == ["mode calm", "mode wild"] * 2
+    report = run_folder.json_report(solution, None, [])
+    assert report["modes"] == ["calm", "wild"]
+    assert report["shape"] == [2, 11, 11]
+
+
+@pytest.mark.slow
+def test_the_files_of_a_problem_with_modes(tmp_path):
+    entry = zoo.catalogue["thermostat"]
+    problem, grid = entry.build(shape=(51,))
+    solution = hjb.solve(problem, grid)
+    *_, (name, path) = run_folder.make(
+        problem, solution, tmp_path, start=entry.start, duration=2.0, mode=entry.mode
+    )  # fmt: skip
+    assert name == "trajectory.png"
+    assert path.modes[0] == 1  # it is cold, so the heater is switched on at once
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["solution.npz", "trajectory.png", "value.png"]
+    assert hjb.load(tmp_path / "solution.npz").grid.modes == ("off", "on")

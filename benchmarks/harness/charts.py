@@ -29,7 +29,7 @@ class Line(NamedTuple):
 
 
 class Chart(NamedTuple):
-    """Two logarithmic axes with lines, and laws: slopes that are drawn grey through a point of the first line."""
+    """Two logarithmic axes with lines, and laws: slopes that are drawn grey through the end of the longest line."""
 
     x: str
     y: str
@@ -39,7 +39,7 @@ class Chart(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """A picture: its message, its charts side by side, and the rows with the machine and the date."""
+    """A picture: its message and its charts, side by side."""
 
     message: str
     charts: list[Chart]
@@ -56,12 +56,12 @@ def lines_of(rows: Sequence[Row], name: str | Callable[[Row], str], x: str, y: s
     return found
 
 
-def with_slopes(lines: Sequence[Line], sign: int = 1) -> list[Line]:
+def with_slopes(lines: Sequence[Line]) -> list[Line]:
     """The lines with the fitted slope of their last three points in the label."""
     found = []
     for line in lines:
         if len(line.x) > 1:
-            slope = sign * np.polyfit(np.log(line.x[-3:]), np.log(line.y[-3:]), 1)[0]
+            slope = np.polyfit(np.log(line.x[-3:]), np.log(line.y[-3:]), 1)[0]
             line = line._replace(label=f"{line.label}: exponent {slope:.2f}")
         found.append(line)
     return found
@@ -124,26 +124,25 @@ def information(rows: Sequence[Row]) -> dict[str, Drawing]:
     }
 
 
+def by_problem(rows: Sequence[Row], name: str, x: str) -> list[Chart]:
+    """One chart per problem: the error against ``x``, called ``name``, with one line per scheme."""
+    problems = dict.fromkeys(row["problem"] for row in rows if _positive(row.get("error")))
+    found = []
+    for problem in problems:
+        lines = lines_of([row for row in rows if row.get("problem") == problem], "scheme", x, "error")
+        found.append(Chart(name, "error", lines, title=problem))
+    return found
+
+
 def precision(rows: Sequence[Row]) -> dict[str, Drawing]:
     """Error against seconds, one chart per problem."""
-    problems = list(dict.fromkeys(row["problem"] for row in rows if _positive(row.get("error"))))
-    charts = [
-        Chart("seconds", "error", lines_of([r for r in rows if r.get("problem") == name], "scheme", "seconds", "error"),
-              title=name)
-        for name in problems
-    ]  # fmt: skip
-    return {"precision": Drawing("Second and fifth order reach a smaller error in the same time", charts)}
+    message = "Second and fifth order reach a smaller error in the same time"
+    return {"precision": Drawing(message, by_problem(rows, "seconds", "seconds"))}
 
 
 def accuracy(rows: Sequence[Row]) -> dict[str, Drawing]:
     """Error against the spacing, one chart per problem."""
-    problems = list(dict.fromkeys(row["problem"] for row in rows if _positive(row.get("error"))))
-    charts = [
-        Chart("spacing", "error", lines_of([r for r in rows if r.get("problem") == name], "scheme", "h", "error"),
-              title=name)
-        for name in problems
-    ]  # fmt: skip
-    return {"accuracy": Drawing("Errors against known answers fall with the spacing", charts)}
+    return {"accuracy": Drawing("Errors against known answers fall with the spacing", by_problem(rows, "spacing", "h"))}
 
 
 CHARTS: dict[str, Callable[[Sequence[Row]], dict[str, Drawing]]] = {
@@ -217,11 +216,12 @@ def _chart(ax: Any, chart: Chart, colours: dict[str, str], *, at_end: bool) -> N
         ticks = axis.get_ticklocs()
         axis.set_ticks(ticks, labels=[f"{tick:,.0f}" if tick >= 1000 else f"{tick:g}" for tick in ticks])
     limits = ax.get_xlim(), ax.get_ylim()
+    longest = max(chart.lines, key=lambda line: line.x[-1] / line.x[0])
     for text, slope in chart.laws:
-        longest = max(chart.lines, key=lambda line: line.x[-1] / line.x[0])
         x = np.geomspace(*limits[0], 401)
         y = longest.y[-1] * (x / longest.x[-1]) ** slope
-        x, y = x[(y > limits[1][0]) & (y < limits[1][1])], y[(y > limits[1][0]) & (y < limits[1][1])]
+        shown = (y > limits[1][0]) & (y < limits[1][1])
+        x, y = x[shown], y[shown]
         ax.plot(x, y, color="0.75", linewidth=4, zorder=0)
         side: dict[str, Any] = {"ha": "left", "xytext": (10, -4)} if slope > 0 else {"ha": "right", "xytext": (-10, 0)}
         ax.annotate(

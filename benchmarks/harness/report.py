@@ -20,7 +20,7 @@ from benchmarks.harness import charts
 from hjbjax.cli import run_folder
 from hjbjax.cli.command_line import Failure
 
-RESULTS = Path(__file__).parents[1] / "results"
+RESULTS = charts.RESULTS
 PACKAGES = ("jax", "numpy", "scipy", "hj-reachability", "quantecon", "numba", "mdpsolver", "scikit-fmm")
 
 

@@ -68,7 +68,7 @@ def _facts(entry: Entry, problem: Problem, grid: Grid) -> Iterator[tuple[str, st
 
 
 def _changes(modes: Modes) -> str:
-    """How the mode changes, in words."""
+    """The kinds of changes of the mode, in words."""
     words = {"at random": modes.rates, "by choice": modes.switching_cost}
     return "changed " + " and ".join(word for word, table in words.items() if table is not None)
 

@@ -128,6 +128,7 @@ def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[O
         upward, downward = schemes.weights(on.scheme.chain, f[axis], left, link, grid, axis)
         for step, weight, length in ((1, upward, link.up), (-1, downward, link.down)):
             beyond = stencil.wall(grid, axis, step)
+            # a product, because XLA stores quotients that several expressions read
             table[stencil.unit(grid, axis, step)] = jnp.where(beyond, 0, weight * (1 / length))
         for step in (step for i, step in grid.sides("neumann") if i == axis):
             _reflect(table, grid, axis, step, noisy=on.problem.noise is not None)

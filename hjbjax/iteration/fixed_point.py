@@ -403,9 +403,9 @@ def _evaluate(
     if task.weights is not None:
         residual = task.norm(jnp.where(task.counting, left.source, 0))
         measured = certificates.measured(bound.residual, jnp.maximum(residual, moved))
-        first_order = False if task.first_order is None else task.first_order
         # the chain's certificate does not apply to another scheme
-        bound = jax.tree.map(functools.partial(jnp.where, first_order), bound, measured)
+        shared = task.first_order is not None
+        bound = jax.tree.map(functools.partial(jnp.where, task.first_order), bound, measured) if shared else measured
     if task.has_lost:
         leaks = bellman.leaks(task.on, policy, task.obstacles.fixed, ~task.counted)
         bound = dataclasses.replace(bound, error=jnp.where(leaks, jnp.inf, bound.error))

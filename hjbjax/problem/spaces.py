@@ -57,7 +57,7 @@ def from_gymnasium(
       ValueError: a grid of a space that is discrete or has infinite bounds.
 
     Example:
-      >>> from types import SimpleNamespace  # in place of gymnasium.make("MountainCarContinuous-v0").observation_space
+      >>> from types import SimpleNamespace  # like make("MountainCarContinuous-v0").observation_space
       >>> space = SimpleNamespace(low=np.float32([-1.2, -0.07]), high=np.float32([0.6, 0.07]), shape=(2,))
       >>> from_gymnasium(space, (91, 71), names=("position", "velocity")).hi.tolist()
       [0.6, 0.07]

@@ -20,7 +20,7 @@ from hjbjax.problem.streams import encodable, plain
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.status import Status
 
-WIDTH = 80  # columns of the printed summary, as many as a page of the documentation shows
+WIDTH = 80  # columns of the printed summary, the width of a page of the documentation
 LABEL = 19  # columns of the labels
 THUMBNAIL = 160  # pixels, and the largest number of nodes per axis
 UNITS = ("bytes", "kB", "MB", "GB", "TB")

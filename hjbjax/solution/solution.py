@@ -97,10 +97,10 @@ class Solution:
       labels: names and units of the controls, the side of the level set, and whether V is a cost or a reward.
       residuals: one number per step; host data.
       stats: "method", "scheme", "device", "dtype", "seconds", "compile_seconds", "bytes", "tol",
-        "high_order_tol" (of a high-order iteration, in words), "certificate" (a sentence),
-        "bounds" (the number of nodes at which a bound holds a control, if there are any and
-        the cost is not affine in the control), "checkpoint" ("written", or the reason why not), "mesh" (devices along
-        each axis, if the nodes were divided) and "versions" (a dict), each if known; host data.
+        "high_order_tol" (the tolerance of a high-order iteration, in words), "certificate" (a sentence), "bounds" (the
+        number of nodes at which a bound holds a control, if there are any and the cost is not affine in the control),
+        "checkpoint" ("written", or the reason why not), "mesh" (devices along each axis, if the nodes were divided)
+        and "versions" (a dict), each if known; host data.
       message: an explanation of the outcome of this solve; empty on return from ``jit``; host data.
       problem: the problem, for target and bounds in plots; ``None`` on return from ``jit`` or from a file, because
         functions are not saved; host data.

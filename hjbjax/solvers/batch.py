@@ -147,7 +147,7 @@ def solve_batch(
             # without nesting, because the host would drive the levels of each lane
             chosen = choose(first, grid, traced=False, method=method, divided=mesh is not None).inner
             on = Discretisation(first, grid, scheme or Upwind(subcell=True), kind)
-            choices = Choices(scheme is None, method is None, levels=False, tol=free_tol)
+            choices = Choices(scheme=scheme is None, method=method is None, levels=False, tol=free_tol)
             with _naming(members[0]):
                 check_on_one_state(first, grid, on.scheme)
             needed = memory.require(first, grid, chosen, kind, max_memory)

@@ -1,4 +1,8 @@
-"""The solution on the next coarser grid, for the estimate of the error of the grid."""
+"""The solutions on the next coarser grid, for the estimate of the grid error.
+
+The estimate is part of the solution. It also ends the second-order iteration, whose last steps would only reduce errors
+far below that of the grid. For this the coarser grid is solved first, by both orders.
+"""
 
 import dataclasses
 
@@ -70,8 +74,8 @@ def comparison(chain: Settled, sharp: Settled, clock: Clock) -> tuple[CoarserAns
         state, code = _iterated(stop_at(level, error, guess), fill_unreachable(level, state), clock)
     if code is not Status.CONVERGED:
         return first, CoarserAnswer(None, reason=UNSETTLED.format(code.name)), None
-    second = answer_of(level, state)
-    return first, second, _expected_error(chain, level.grid, first.value, values_of(level, state))
+    second = values_of(level, state)
+    return first, CoarserAnswer(level.grid, second), _expected_error(chain, level.grid, first.value, second)
 
 
 def _expected_error(chain: Settled, coarse: Grid, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -107,7 +111,7 @@ def stop_at(task: Task, error: np.ndarray, value: np.ndarray) -> Task:
     return dataclasses.replace(task, weights=weights.astype(task.tol.dtype))
 
 
-def left_over(task: Task, left: float, error: np.ndarray) -> np.ndarray:
+def remaining_error(task: Task, left: float, error: np.ndarray) -> np.ndarray:
     """The error of the iteration, (*grid), for its norm ``left``; it is spread like the estimate of the grid error."""
     largest, mean = np.asarray(task.weights, float)
     if mean == 0 or np.max(error) == 0:

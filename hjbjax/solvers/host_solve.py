@@ -36,13 +36,13 @@ class Choices:
       scheme: the scheme.
       method: the method.
       levels: coarser grids.
-      tol: the tolerance of the second-order solution.
+      tol: the tolerance, so that a second-order iteration may stop by the grid error.
     """
 
     scheme: bool
     method: bool
     levels: bool
-    tol: bool = False
+    tol: bool
 
     @property
     def both(self) -> bool:

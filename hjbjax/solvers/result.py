@@ -26,7 +26,7 @@ from hjbjax.solution.status import Status, warn
 from hjbjax.solvers import grid_error
 from hjbjax.solvers.arrival import warn_of_no_arrival
 from hjbjax.solvers.coarse_levels import CoarserAnswer
-from hjbjax.solvers.coarser_answer import SHARE, left_over
+from hjbjax.solvers.coarser_answer import SHARE, remaining_error
 from hjbjax.solvers.contact import contact_of_solve
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
@@ -183,7 +183,7 @@ def _left(solution: Solution, settled: Settled, error: np.ndarray) -> np.ndarray
     known = float(settled.state.progress.best[0]) if solution.error is None else float(solution.error)
     left = min(known, float(settled.task.tol))
     if solution.error is None and settled.task.weights is not None:
-        return left_over(settled.task, left, error)
+        return remaining_error(settled.task, left, error)
     return np.full(error.shape, left)
 
 

@@ -34,8 +34,8 @@ def second_order(settled: Settled, scheme: Scheme, clock: Clock, *, to_grid_erro
 def raise_order(settled: Settled, scheme: Scheme, clock: Clock, *, to_grid_error: bool) -> Settled:
     """The task of a high-order scheme, with the state of the monotone solution, its ``origin``.
 
-    With ``to_grid_error`` its iteration may stop at a fraction of the error of the grid at every node. Both solutions
-    on the next coarser grid are computed for this, and kept as ``coarser``.
+    With ``to_grid_error`` its iteration may stop at a fraction of the grid error. The solutions of both orders on the
+    next coarser grid are computed to estimate this error, and kept as ``coarser``.
     """
     task, assumptions = raised(settled.task, settled.assumptions, scheme)
     sharp = settled._replace(task=task, assumptions=assumptions, origin=settled, coarser=None)
@@ -43,11 +43,9 @@ def raise_order(settled: Settled, scheme: Scheme, clock: Clock, *, to_grid_error
         return sharp
     first, second, error = comparison(settled, sharp, clock)
     sharp = sharp._replace(origin=settled._replace(coarser=first), coarser=second)
-    return (
-        sharp
-        if error is None
-        else sharp._replace(task=stop_at(task, error, fill_unreachable(settled.task, settled.state)))
-    )
+    if error is None:
+        return sharp
+    return sharp._replace(task=stop_at(task, error, fill_unreachable(settled.task, settled.state)))
 
 
 def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) -> Settled:

@@ -144,7 +144,7 @@ def solve(
         checkpoint, [problem], grid, resume=resume, caller="solve", together=clock.together, method=method,
         scheme=scheme, tol=tol, guess=guess, dtype=kind,
     )  # fmt: skip
-    choices = Choices(scheme is None, free, levels=free, tol=tol is None)
+    choices = Choices(scheme=scheme is None, method=free, levels=free, tol=tol is None)
     tol = TOL if tol is None else tol
     if scheme is not None and paths is not None:
         with (

@@ -264,7 +264,8 @@ def _solved(
     """The result of one lane, in NumPy; its warnings are dropped, because the user's line is not on the stack."""
     with own_settings(x64=asked.x64), keeping_warnings():
         check_spacings(grid, asked.inner)
-        choices = Choices(asked.scheme is None, method is None, levels=method is None, tol=asked.free_tol)
+        free = method is None
+        choices = Choices(scheme=asked.scheme is None, method=free, levels=free, tol=asked.free_tol)
         may_follow = _may_follow(asked, problem, grid)
         method = choose(problem, grid, traced=False, method=method)
         on = Discretisation(problem, grid, asked.scheme or Upwind(subcell=True), asked.inner)

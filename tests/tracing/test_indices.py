@@ -8,7 +8,7 @@ from small_problems import U, drift, refused
 
 import hjbjax as hjb
 from hjbjax import zoo
-from hjbjax.discretisation.posing import over_checked_modes
+from hjbjax.discretisation.posing import with_mode_axis
 from hjbjax.tracing import checks, indices
 
 ALONG = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (5, 5))
@@ -98,5 +98,4 @@ def test_every_front_door():
 
 @pytest.mark.parametrize("name", list(zoo.catalogue))
 def test_the_zoo_stays_within(name):
-    problem, grid = zoo.catalogue[name].build()
-    checks.shapes(over_checked_modes(problem, grid.ndim), grid, hjb.Upwind())
+    with_mode_axis()(checks.shapes)(*zoo.catalogue[name].build(), hjb.Upwind())

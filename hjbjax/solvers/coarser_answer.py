@@ -60,7 +60,8 @@ def comparison(chain: Settled, sharp: Settled, clock: Clock) -> tuple[CoarserAns
       clock: the limits.
 
     Returns:
-      The monotone and the second-order answer, and the estimate, (*grid) in cost units; None if there is none.
+      The monotone and the second-order answer, and the estimate on the coarser grid, in cost units; None if there is
+      none.
     """
     level = _level(sharp.running, clock)
     first = chain.coarser or coarser_answer(chain, clock)
@@ -79,7 +80,7 @@ def comparison(chain: Settled, sharp: Settled, clock: Clock) -> tuple[CoarserAns
 
 
 def _expected_error(chain: Settled, coarse: Grid, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The error of the grid for the extrapolated second-order value, (*grid), cost units.
+    """The error of the fine grid for the extrapolated second-order value, (*coarse), cost units.
 
     Args:
       chain: the monotone solution on the fine grid.
@@ -93,7 +94,7 @@ def _expected_error(chain: Settled, coarse: Grid, first: np.ndarray, second: np.
     expected = value + nested_grids.prolong(change, coarse, grid) / nested_grids.ratio_of(grid, coarse)
     fixed = np.broadcast_to(np.asarray(task.obstacles.fixed), grid.shape)
     expected = np.where(fixed, value, expected)
-    return grid_error.estimate_error(grid_error.TwoGrids(grid, coarse, expected, second, fixed, chain=value))
+    return grid_error.estimate_on_coarse(grid_error.TwoGrids(grid, coarse, expected, second, fixed, chain=value))
 
 
 def stop_at(task: Task, error: np.ndarray, value: np.ndarray) -> Task:

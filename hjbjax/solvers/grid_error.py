@@ -70,11 +70,17 @@ class TwoGrids:
 
 def estimate_error(answers: TwoGrids) -> np.ndarray:
     """Estimate |V − V_h| at the nodes, shape (*grid), in cost units; zero where V is infinite."""
+    error = nested_grids.prolong(estimate_on_coarse(answers), answers.coarse, answers.grid)
+    error[~np.isfinite(answers.value)] = 0
+    return error
+
+
+def estimate_on_coarse(answers: TwoGrids) -> np.ndarray:
+    """Estimate |V − V_h| near the nodes of the coarser grid, shape (*coarse), in cost units."""
     grid, coarse, value = answers.grid, answers.coarse, answers.value
     change = nested_grids.apart(nested_grids.restrict(value, grid, coarse), answers.before)
     ratio = nested_grids.ratio_of(grid, coarse)
-    finite = np.isfinite(value)
-    free = finite & ~answers.held
+    free = np.isfinite(value) & ~answers.held
     fine = _along_axes(np.where(free, value, np.nan), grid, coarse)
     known = nested_grids.at_nearest_nodes(free, grid, coarse) & np.isfinite(answers.before)
     rough = _around(np.where(known, answers.before, np.nan), coarse)
@@ -91,8 +97,7 @@ def estimate_error(answers: TwoGrids) -> np.ndarray:
         )
         order = np.minimum(bends, _order_of_slopes(change, gain, coarse))
     order = np.minimum(order, answers.highest)
-    error = np.maximum(change / (ratio**order - 1), _jumps(fine, rough, ratio))
-    return np.where(finite, nested_grids.prolong(error, coarse, grid), 0)
+    return np.maximum(change / (ratio**order - 1), _jumps(fine, rough, ratio))
 
 
 def is_a_point(target: np.ndarray) -> bool:

@@ -149,8 +149,11 @@ def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
         cell = np.minimum(place.astype(int), coarse.intervals(axis) - 1)
         weight = np.asarray((place - cell).reshape([-1 if i == axis else 1 for i in range(fine.ndim)]), values.dtype)
         below = np.take(values, cell, axis=axis)
+        below *= 1 - weight
         above = np.take(values, (cell + 1) % coarse.shape[axis], axis=axis)
-        values = (1 - weight) * below + weight * above
+        above *= weight
+        below += above  # in place: at most two arrays on the fine grid at a time
+        values = below
     return values
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import pytest
+import shares
 import xla
 from hypothesis import settings
 
@@ -65,6 +66,19 @@ class Figures:
 def pytest_configure(config):
     """Doctests lie outside of this folder, whose own hooks they do not see."""
     config.pluginmanager.register(Figures())
+
+
+def pytest_addoption(parser):
+    """The long tests take an hour or more on a slow machine, so each run of CI takes a share of them."""
+    parser.addoption("--share", metavar="K/N", default="1/1", help="run the tests of every N-th file from the K-th on")
+
+
+@pytest.hookimpl(trylast=True)  # after `-m` and `-k`, so that all files counted have tests to run
+def pytest_collection_modifyitems(config, items):
+    """Leave out the files that belong to another share."""
+    chosen = shares.select({item.path for item in items}, config.getoption("--share"))
+    config.hook.pytest_deselected(items=[item for item in items if item.path not in chosen])
+    items[:] = [item for item in items if item.path in chosen]
 
 
 def pytest_runtest_setup(item):

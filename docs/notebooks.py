@@ -17,7 +17,7 @@ def names() -> list[str]:
 
 
 def render(folder: Path, names: Sequence[str] = ()) -> None:
-    """One page a notebook in a folder, the pictures beside it; of all notebooks, or of those that are named."""
+    """Write one page per notebook and its pictures into a folder, for all notebooks or for the named ones."""
     import jupytext
     import nbformat
     from nbclient import NotebookClient
@@ -31,11 +31,11 @@ def render(folder: Path, names: Sequence[str] = ()) -> None:
             continue
         print(path.stem, flush=True)
         notebook = jupytext.read(path)
-        # twice as many pixels, of which ``shrink`` makes one: a surface of small triangles shows no grain
+        # ``shrink`` halves the resolution afterwards, which smooths surfaces of small triangles
         notebook.cells.insert(0, nbformat.v4.new_code_cell("%config InlineBackend.figure_format = 'retina'"))
-        # lines printed one after the other are one block
+        # consecutive printed lines become one block
         NotebookClient(notebook, timeout=1200, kernel_name="python3", coalesce_streams=True).execute()
-        for picture in folder.glob(f"{path.stem}-*.*"):  # of the last time, now that there are new ones
+        for picture in folder.glob(f"{path.stem}-*.*"):  # old pictures, only once there are new ones
             picture.unlink()
         lines: list[str] = []
         for cell in notebook.cells[1:]:
@@ -48,7 +48,7 @@ def render(folder: Path, names: Sequence[str] = ()) -> None:
 
 
 def shown(output: dict, folder: Path, name: str) -> list[str]:
-    """The lines of one output: a picture, put into the folder under a name, or text."""
+    """The lines of one output: a link to its picture, which is saved in the folder, or its text."""
     data = output.get("data", {})
     for kind, ending in (("image/png", ".png"), ("image/webp", ".webp")):
         if kind in data:
@@ -60,7 +60,7 @@ def shown(output: dict, folder: Path, name: str) -> list[str]:
 
 
 def cells(page: str) -> list[str]:
-    """The code cells of a page, to be compared with those of its notebook."""
+    """The code cells of a page; a test compares them with the cells of the notebook."""
     import re
 
     return re.findall(r"^```py\n(.*?)\n```$", page, re.MULTILINE | re.DOTALL)

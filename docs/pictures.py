@@ -1,7 +1,7 @@
-"""``python -m docs pictures``: what the README and the pages show, made by the code that stands beside it.
+"""``python -m docs pictures`` draws the pictures of the README, of the pages and of the gallery, in some minutes.
 
-The Python blocks of a page run in ``docs/pictures``, where what they save are the pictures; then every ready
-problem is solved for the page of the gallery. All of it takes some minutes.
+The Python blocks of a page run in ``docs/pictures`` and save their pictures there. Then every ready problem is solved
+for the gallery.
 """
 
 import contextlib
@@ -13,15 +13,15 @@ from pathlib import Path
 from hjbjax import zoo
 from hjbjax.cli import gallery, run_folder
 
-COLOURS = 256  # of a palette: a quarter of the bytes of full colours
-ALIKE = 16  # of the 256 shades of red, of green and of blue count as one when colours are counted
-EXACT = 16  # colours that are kept as they are: paper, panes, frames and lines
+COLOURS = 256  # size of the palette; a picture has a quarter of the bytes of full colours
+ALIKE = 16  # this number of adjacent shades of red, green or blue count as one colour
+EXACT = 16  # the most frequent colours, which are not averaged: paper, panes, frames and lines
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = ("README.md", "docs/getting_started.md")
 
 
 def draw(docs: Path, names: Sequence[str] = ()) -> None:
-    """The pictures of the pages, and the gallery; or those of the ready problems that are named, and no page."""
+    """Draw all pictures and write the page of the gallery, or draw only the pictures of the named problems."""
     folder = docs / "pictures"
     if not names:
         pictures_of_pages(docs, folder)
@@ -29,13 +29,13 @@ def draw(docs: Path, names: Sequence[str] = ()) -> None:
     for entry in (zoo.catalogue[name] for name in names or zoo.catalogue):
         print(entry.name, flush=True)
         cards.append(gallery.card(entry))
-        write_pictures(cards[-1], folder / "gallery")  # at once: what was computed stays after an interrupt
+        write_pictures(cards[-1], folder / "gallery")  # immediately, so that finished pictures survive an interrupt
     if not names:
         (docs / "gallery.md").write_text(gallery_page(cards), encoding="utf-8")
 
 
 def pictures_of_pages(docs: Path, folder: Path) -> None:
-    """Run the pages, and replace the pictures of the last time when all new ones are there."""
+    """Run the pages; the new pictures replace the old ones once all are drawn."""
     with run_folder.staging(folder) as new:
         for page in PAGES:
             run(docs.parent / page, new)
@@ -49,10 +49,10 @@ def pictures_of_pages(docs: Path, folder: Path) -> None:
 
 
 def run(page: Path, folder: Path) -> None:
-    """The Python blocks of a page, in one namespace, with their files in a folder."""
+    """Run the Python blocks of a page in one namespace; they save their files in a folder."""
     from matplotlib import pyplot
 
-    pyplot.close("all")  # or this page would draw on the axes of the one before
+    pyplot.close("all")  # otherwise this page would draw on the axes of the previous page
     names: dict[str, object] = {}
     folder.mkdir(parents=True, exist_ok=True)
     with contextlib.chdir(folder):
@@ -63,11 +63,11 @@ def run(page: Path, folder: Path) -> None:
 
 
 def shrink(picture: Path) -> None:
-    """A PNG with a palette in place of colours.
+    """Halve the resolution of a PNG and reduce its colours to a palette.
 
-    The palette is made of colours that are alike, by the root of how often they occur: by their number the large areas
-    take all of it, and a colour scale beside them becomes a staircase. What is drawn at 200 dots an inch is halved,
-    which is smoother than what is drawn at 100.
+    Groups of similar colours enter the palette with the square root of their frequency as weight. With the frequency
+    itself the large areas would take the whole palette, and a colour bar would become a staircase. A picture drawn at
+    200 dots per inch and halved is smoother than one drawn at 100.
     """
     import numpy as np
     from PIL import Image
@@ -81,11 +81,11 @@ def shrink(picture: Path) -> None:
     size = np.bincount(group.ravel(), often)
     mean = np.stack([np.bincount(group.ravel(), often * shade) / size for shade in found.T], axis=-1)
     row = np.repeat(mean.astype(np.uint8), np.ceil(np.sqrt(size)).astype(int), axis=0)
-    # three rounds of k-means: without them the palette is the colour map alone, and an orange line turns brown
+    # without three rounds of k-means the palette has only the colour map, and an orange line turns brown
     means = Image.fromarray(row[None]).quantize(COLOURS - EXACT, kmeans=3, dither=Image.Dither.NONE).getpalette()
-    # white, above all, stays as it is: a mean of near whites would be grey
+    # frequent colours are not averaged; the mean of near whites would be grey
     palette = np.concatenate([found[np.argsort(-often)[:EXACT]], np.reshape(means, (-1, 3))])
-    # by ourselves, as Pillow looks for the nearest colour among roughly rounded ones
+    # computed here, because Pillow rounds colours before it searches for the nearest
     nearest = [np.argmin(np.sum((palette - colour.astype(int)) ** 2, axis=1)) for colour in found]
     small = Image.fromarray(np.asarray(nearest, np.uint8)[place.ravel()].reshape(full.height, full.width))
     small.putpalette(palette.astype(np.uint8).ravel().tolist())

@@ -76,8 +76,8 @@ def reach_probability(
       horizon: the time limit, in units of time; ``None`` is for all times.
       least: compute the least probability instead; the control tries to avoid the target.
       feedback: a Solution or a function of the state that replaces the control; then nothing is optimised. Where a
-        Solution has no action the state does not move. A marched one must be stored at sufficiently dense times up to
-        the horizon.
+        Solution has no action the state does not move. A marched Solution must be stored at sufficiently dense
+        times up to the horizon.
       options: other arguments of ``march``, or of ``solve`` without a horizon: times, scheme, method, ...; ``tol``, a
         bound on the residual and the last step of ``solve``, is 1e-6 by default. The default scheme ``Upwind()`` gives
         the probabilities of a chain.

@@ -95,7 +95,7 @@ def at_nodes_of(reference: Solution | Callable, grid: Grid, mask: Mask) -> np.nd
         values = np.asarray(reference.value_at(grid.nodes(), clamp=True))
     else:
         values = _evaluate(reference, grid, "the reference")
-    # NaN outside the region is harmless, and inf is a value
+    # only NaN inside the region is a fault; an infinite reference is a value like any other
     missing = np.isnan(values) & mask
     if missing.any():
         index = tuple(int(i) for i in np.argwhere(missing)[0])

@@ -1,9 +1,9 @@
 """Bracketing search for a root of a continuous function of one number, as a state and its step.
 
 Chandrupatla's method keeps a bracket and three points. The next point is the inverse quadratic interpolation of the
-three if that is safe, and otherwise the middle of the bracket. It needs about as few evaluations as Brent's method, and
-never more than bisection by much. The step works on numbers and on tracers, so the same search runs on the host and in
-a compiled loop.
+three if that is safe, and otherwise the middle of the bracket. It needs about the same number of evaluations as Brent's
+method, and never many more than bisection. The step works on numbers and on tracers, so the same search runs on the
+host and in a compiled loop.
 
 Source: T. R. Chandrupatla, A new hybrid quadratic/bisection algorithm for finding the zero of a nonlinear function
 without using derivatives, Adv. Eng. Software 28 (1997).

@@ -1,4 +1,6 @@
-"""Decorators of public functions, for problems with modes, jumps, pushes, growth, or bounds or discounts of the state.
+"""Decorators of public functions for problems with modes, jumps, pushes, growth, or data that depend on the state.
+
+These data are the bounds of the controls and the discount.
 
 The solvers support fixed sets of controls and constant discounts, modes as the first entry of the state, and all jumps
 and all pushes as functions. A decorated function receives such a problem, and its grid, instead of the user's. In the
@@ -58,7 +60,7 @@ def in_time_of_discount(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def with_horizon(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator of a public function of (problem, grid, horizon, ...); otherwise like ``without_horizon``."""
+    """Decorator like ``without_horizon``, for a public function of (problem, grid, horizon, ...)."""
     return _posing(function, _with_killing)
 
 

@@ -228,7 +228,7 @@ def _extremes(loop: Loop, start: Number, seen: tuple[Array, Array], before: jax.
 
 
 def _path(ivp: InitialValueProblem, stepping: Stepping, last: Progress, shown: Rows) -> tuple[Path, jax.Array]:
-    """The path of full length from its last state and the rows of its intervals, and a mask of its intervals."""
+    """The path, padded to its full length, and a mask of the intervals before its end."""
     loop, x0, start = ivp.loop, ivp.x0, ivp.times[0]
     (t, y, code, count, extremes), (later, states, controls, disturbances, active) = last, shown
     hit, ended = code == PathStatus.TARGET, code == PathStatus.DURATION
@@ -429,7 +429,7 @@ def _after_steps(ivp: InitialValueProblem, stepping: Stepping) -> Callable:
     def after(t: Array, later: Array, y: Array, moved: jax.Array, beginning: Beginning) -> jax.Array:
         if loop.push is None:
             pushed = moved
-        else:  # also beyond a target, where a bridge ends the path before the end of the step
+        else:  # also in the target: a bridge may end the path earlier in the step
             pushed = jnp.concatenate([after_pushes(loop, later, moved[: n + 1], start), moved[n + 1 :]])
         if not _is_bridged(loop):
             return pushed

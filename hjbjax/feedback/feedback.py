@@ -281,7 +281,7 @@ def _minimax(greedy: GreedyFeedback, where: tuple, costate: Array) -> tuple[Arra
     moments = [jnp.broadcast_to(jnp.asarray(t, costate.dtype), shape[:-1]).reshape(-1) for t in times]
     answers = list(jax.vmap(lambda x, p, *t: _at(greedy, t, x, p))(states, costate.reshape(-1, shape[-1]), *moments))
     if greedy.grid.sides("constrained"):
-        # the block around a state has no wall, so its minimiser may leave the box; the controls of the nodes do not
+        # the minimiser in the block around a state ignores the wall and may leave the box; the nodes' controls do not
         beside = _beside_a_wall(greedy.grid, states)[:, None]
         looks = [greedy.solution.control_at, greedy.solution.disturbance_at][: 1 + greedy.problem.is_game]
         for player, look in enumerate(looks):

@@ -65,7 +65,7 @@ class OfLongerState:
 def with_entries(
     loop: Loop, x0: Any, first: Sequence, motion: Motion, weight: Callable | None = None
 ) -> tuple[Loop, Any]:
-    """The loop with further entries of the state, without bounds, and its start.
+    """The loop and its start, with the state extended by entries that have no bounds.
 
     Args:
       loop: the loop.

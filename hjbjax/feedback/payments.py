@@ -76,7 +76,8 @@ def solution_of(feedback: object) -> Solution | None:
 def is_tube(problem: Problem) -> bool:
     """True if the cost of a path is an extreme along it: a running maximum, or only a cost of stopping.
 
-    With noise the moment to stop must not depend on the future, so only a running maximum is an extreme.
+    With noise the controller must decide to stop without knowing the rest of the path. The cost is then the cost at the
+    chosen time and not the least one along the path, so only a running maximum counts.
     """
     if problem.running_max is not None:
         return True

@@ -6,8 +6,9 @@ After every step of the integrator the state is moved along the pushes of the so
 region, and the cost of the way is paid, discounted to the start. On the grid the boundary consists of the first nodes
 that are not pushed, as in the Markov chain. Between the nodes, distance and cost are multilinear.
 
-The path overshoots the boundary by about σ√Δt within a step, so its law has the order ½ in the step Δt. Its mean cost
-has the order 1 if the boundary is optimal, since V then leaves the push region with a continuous second derivative.
+The path overshoots the boundary by about σ√Δt within a step, so the error of its law is of order ½ in the step Δt. The
+error of its mean cost is of order 1 if the boundary is optimal, since V then leaves the push region with a continuous
+second derivative.
 """
 
 import contextlib

@@ -320,7 +320,7 @@ def rollout(
 def _over_modes(
     problem: Problem, feedback: Feedback, disturbance: Callable | None, grid: Grid | None, n: int
 ) -> tuple[Problem, Feedback, Callable | None, Grid | None]:
-    """Everything for a state that begins with the mode, with jumps and pushes as functions; unchanged without all."""
+    """The arguments for states that begin with the mode, with jumps and pushes as functions, if the problem has any."""
     modes = problem.modes
     if (modes is not None or problem.jumps) and problem.running_max is not None:
         raise ValueError("simulate: got running_max with modes or jumps; the cost of such a path is not computed")

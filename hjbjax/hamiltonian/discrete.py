@@ -68,8 +68,8 @@ class DiscreteHamiltonian:
     def gain(self, axis: int, f: Any, a: Any) -> Any:
         """[(e + h⁻ f) D⁺ − (e − h⁺ f) D⁻]/(h⁺ + h⁻), or with other slopes; infinite if f leaves a constrained end.
 
-        Candidates for an optimum, including the kink at f = 0, are therefore only good if they are admissible. A drift
-        of the size of rounding does not lead to an unreachable node, whose value is far above all others.
+        A candidate for the optimum, such as the kink at f = 0, must therefore also be admissible. A drift of the size
+        of rounding does not lead to an unreachable node, whose value is far above all others.
         """
         # sin π is 1e-16 instead of 0; times the value of an unreachable node, 1e8 times all others, it would matter
         if self.lost is not None:

@@ -281,8 +281,8 @@ def _program(part: _Part, group: Sequence[int], gains: Sequence[Kinked]) -> tupl
 def _jumps(grid: Grid, axis: int, gain: Kinked) -> tuple[PerNode, list[tuple[Any, Any, Any]]]:
     """A gain as base · f + Σ jump max(side (f − kink), 0): the base and the triples (kink, jump, side).
 
-    The base is the smallest slope of all pieces. Next to an unreachable node another slope is huge, and as the base it
-    would leave no digits for the rest. A piece that leaves through a constrained end has an infinite jump.
+    The base is the smallest slope of all pieces. Next to an unreachable node one slope is huge. As the base it would
+    cancel all digits of the others. A piece that leaves through a constrained end has an infinite jump.
     """
     barred = _barred(grid, axis, gain)
     sizes = [jnp.where(out, jnp.inf, jnp.abs(d)) for out, d in zip(barred, gain.derivatives, strict=True)]

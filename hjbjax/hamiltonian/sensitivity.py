@@ -97,7 +97,7 @@ class Optimum:
 def actions(on: Discretisation, value: Field, lost: jax.Array | None, u: Action, d: Action) -> tuple[Action, Action]:
     """The optimal actions as differentiable functions of a value and of all numbers in ``on``.
 
-    The result is meant for its derivatives. Its numbers may differ from ``u`` and ``d`` by rounding, and if several
+    Use the result for its derivatives only. Its numbers may differ from ``u`` and ``d`` by rounding, or because several
     actions are equally good.
 
     Args:

@@ -277,7 +277,7 @@ def policy_equation(
 def with_interventions(weights: Rates, interventions: Interventions, goes: Sequence[jax.Array]) -> Rates:
     """The weights with a weight of one to the node to which an intervention leads, where ``goes`` is true.
 
-    An intervention is a jump at no time: V(x) = c + V(x + o), so the row reads δ(x) = s + δ(x + o).
+    An intervention is a jump that takes no time: V(x) = c + V(x + o), so the row reads δ(x) = s + δ(x + o).
     """
     if not goes:
         return weights

@@ -223,7 +223,7 @@ def evaluate(method: Evaluation, equation: PolicyEquation, grid: Grid) -> Field:
 
 
 def _with_exact_interventions(equation: PolicyEquation, delta: Field) -> Field:
-    """The correction with δ(x) = s + δ(x + o) in the rows of an intervention, which an approximate solve misses."""
+    """The correction with δ(x) = s + δ(x + o) exact at nodes with an intervention; linear solves meet it roughly."""
     table = dict(zip(equation.weights.offsets, equation.weights.values, strict=True))
     goes = [table[offset] == 1 for offset in equation.interventions.offsets]
     return equation.interventions.followed(goes, equation.source, delta)

@@ -160,7 +160,7 @@ class Task(GridTask):
 
     def size(self, value: Field) -> Scalar:
         """The largest |V| at the counted nodes."""
-        if not jnp.ndim(self.counting):  # all nodes count: no array of |V|
+        if not jnp.ndim(self.counting):  # all nodes count, so no array of |V| is needed
             return jnp.maximum(self.layout.largest(value), -self.layout.least(value))
         return self.layout.largest(jnp.where(self.counting, jnp.abs(value), 0))
 

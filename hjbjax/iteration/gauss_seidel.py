@@ -317,7 +317,7 @@ def _with_margins(planes: jax.Array, axis: int) -> jax.Array:
         above = side == 0
         inner = jax.lax.dynamic_slice_in_dim(planes, jnp.where(above, 1, count), 1, axis)
         start: list[Index] = [0] * planes.ndim
-        # S[d, j] with d − Σ j: moving by a whole axis sideways is the same number of slices further
+        # S[d, j] depends on d − Σ j, so a shift of j by the whole axis is a shift of d by the same number of slices
         inner = jnp.roll(inner, jnp.where(above, count, -count), axis=0)
         start[axis] = jnp.where(above, count + 1, 0)
         return jax.lax.dynamic_update_slice(planes, inner, start)

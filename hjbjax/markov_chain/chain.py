@@ -420,7 +420,7 @@ def _under_policy(problem: Problem, grid: Grid, policy: Any, disturbance: Any, s
     """The rates under a policy; zero on the target and at nodes without an action."""
     checks.check_indices(grid)
     _refuse_changes(problem)
-    problem = altered(problem, growth=None)  # of the payments, not of the motion
+    problem = altered(problem, growth=None)  # the growth scales the payments and does not change the motion
     u, d, active = decision_process.policy_components(problem, grid, policy, disturbance)
     active &= ~decision_process.target(problem, grid, t)[0]
     # the dtype of the policy determines what counts as rounding: float32 is off by 1e-7 at an end

@@ -333,8 +333,8 @@ def check_parts(counts: tuple[int, ...], grid_shape: tuple[int, ...], caller: st
     """
     if len(counts) > len(grid_shape):
         raise ValueError(
-            f"{caller}: mesh has {len(counts)} axes, {counts}, the grid {len(grid_shape)}; its i-th divides the grid's "
-            "i-th"
+            f"{caller}: got a mesh of {len(counts)} axes, {counts}, wanted at most {len(grid_shape)}: axis i of "
+            "the mesh divides axis i of the grid"
         )
     for axis, (size, count) in enumerate(zip(counts, grid_shape, strict=False)):
         if size > 1 and count // size < FEWEST:

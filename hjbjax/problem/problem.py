@@ -65,9 +65,9 @@ class Problem:
         functions of (t, x) if ``time_dependent``.
       growth: g, the rate at which the scale of all payments grows, with the arguments of ``drift``. If the value is
         proportional to a state K with dK = g K dt, such as the capital of a firm, leave K out of x: the value per unit
-        of K has the discount β − g. A hazard rate that depends on the control is minus a growth. Without a horizon
-        β − g must be positive for all admissible controls. The minimum over u stays exact if g is affine in u. Default:
-        zero.
+        of K has the discount β − g. A hazard rate that depends on the control is a negative growth. Without a
+        horizon β − g must be positive for all admissible controls. The minimum over u stays exact if g is affine in u.
+        Default: zero.
       target: a function that is ≤ 0 inside the target, where paths end.
       exit_cost: the cost paid on the target; a number or a function. Default: zero.
       terminal_cost: V at the horizon, for ``march``.

@@ -213,7 +213,7 @@ class Solution:
 
     @property
     def switching(self) -> Any:
-        """The number of the mode to which the controller changes at once, at every node; the node's own elsewhere.
+        """For every node the number of the mode after the controller's change, or of the current mode without a change.
 
         Integers of the shape of the value. ``None`` if the controller cannot change the mode.
 

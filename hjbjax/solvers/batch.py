@@ -197,7 +197,7 @@ def _over_lanes(mesh: object, lanes: Sequence[Problem], grid: Grid, method: Meth
 
 
 def _same_program(problems: Sequence[Problem]) -> list[list[int]]:
-    """Groups of lanes whose problems share functions and shapes, and so a program, in the order of first appearance."""
+    """Groups of lanes that share one program (the same functions and shapes), in the order of first appearance."""
     # numbers are leaves and may differ; functions, kinds of sets and flags are structure, each with its own program
     flat = map(jax.tree.flatten, problems)
     return _groups((structure, tuple(np.shape(leaf) for leaf in leaves)) for leaves, structure in flat)

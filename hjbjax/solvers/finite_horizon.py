@@ -53,7 +53,7 @@ ROUNDING = 1e-12  # relative amount by which a kept time may exceed the horizon
 PROBES = 33  # times at which a given step, and constrained ends, are checked for a time-dependent problem
 FEWEST = 100  # number of steps if no stability limit is known in advance: implicit, or sampled rates
 
-RISE, RISE_GIVEN = 0.02, 0.5  # growth of V in a step: the largest one by default, and in an implicit step that is given
+RISE, RISE_GIVEN = 0.02, 0.5  # largest growth of V per step: by default, and if the caller sets implicit steps
 
 _stable = jax.jit(time_stepping.stable, static_argnames="tableau")
 _fastest_growth = jax.jit(time_stepping.fastest_growth)
@@ -328,7 +328,7 @@ def _check_distinct(kept: np.ndarray, kind: np.dtype) -> None:
 
 
 def _without_moving_target(problem: Problem) -> Problem:
-    """The problem without its target if this depends on time, since it may be outside the box when checked."""
+    """The problem without a target that depends on time, which may be outside the box at the time of the check."""
     if not problem.time_dependent or problem.target is None:
         return problem
     return altered(problem, target=None, exit_cost=None)
@@ -407,7 +407,7 @@ def _within_growth(
 
 
 def _checks(on: Discretisation, method: TimeMethod) -> tuple[bool, bool, bool]:
-    """Three flags: steps must check the rates, correlated noise under their actions, and Isaacs' gap."""
+    """Three flags, true if steps must check: the rates, correlated noise under their actions, and the Isaacs gap."""
     problem = on.problem
     players, moving = on.players, problem.time_dependent
     # Q is known in advance if it is largest at an end of the sets; otherwise only under the chosen actions
@@ -440,12 +440,12 @@ def _blow_up_nodes(on: Discretisation, share: float | None) -> Mask | None:
 
 
 def _check_inner(problem: Problem, share: float | None) -> None:
-    """Refuse a fraction of the box to watch that is not a fraction, or has no disturbance to watch."""
+    """Refuse ``inner`` outside [0, 1], and ``inner`` for a problem without a ``Box`` of disturbances."""
     share = 0.0 if share is None else share
     if not arguments.is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"march: inner = {share!r}; wanted the fraction of the box to watch, from 0 (none) to 1")
     if share and not isinstance(problem.disturbances, Box):
-        raise ValueError(f"march: inner = {share:g} watches a Box of disturbances; got {problem.disturbances!r}")
+        raise ValueError(f"march: inner = {share:g} requires disturbances in a Box; got {problem.disturbances!r}")
 
 
 @as_one_program
@@ -477,7 +477,7 @@ def _march_traced(
     touching: list[dict[str, Any]] = []
     fine = _is_stable(on, method, horizon, step)
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
-        # rounding must not add a step to an interval of a whole number of steps, nor one for a kept time at the horizon
+        # without 1e-6 rounding could add a step to a whole number of steps; none if a kept time is the horizon
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
         (value, ok), count = time_stepping.repeat(task, value, begin, end, steps), count + steps
         fine &= ok & jnp.all(jnp.isfinite(value))

@@ -42,7 +42,7 @@ Feedback: TypeAlias = tuple[
 ]
 
 
-# not donated: a chunk that ends in NaN is repeated from the front before it
+# the front is not donated, because a chunk that ends in NaN is repeated from the front at its start
 @WideJit
 def _run(march: March, front: Front, until: Number, most: Number) -> Front:
     """``time_stepping.run`` on all devices, each with its own nodes."""

@@ -36,11 +36,11 @@ GAP = 0.05  # relative to the actions' influence; if Isaacs' condition holds, up
 COARSE = 0.1  # fraction of the range of V: a larger grid error is worth a warning ...
 NODES = 0.05  # ... at more than this fraction of the nodes
 FLAT = 1e-3  # fraction of max |V|: a smaller range is not a scale for errors
-MOST = 2 / 3  # fraction of an end's nodes; at the end of a position, its velocity points outwards at half of them
+MOST = 2 / 3  # fraction of an end's nodes; ½ is normal: at the end of a position half of the velocities point outwards
 
 
 def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
-    """The solution in NumPy, infinite where the target cannot be reached, without a policy where there is none.
+    """The solution in NumPy: V is infinite where the target cannot be reached, and u is NaN where no action is taken.
 
     The Isaacs gap has its own program, and nothing is compiled after a ``cut``.
     """
@@ -66,7 +66,7 @@ def finish(settled: Settled, grid: Grid, cut: bool = False) -> Solution:
     arrays = {name: getattr(solution, name) for name in ("value", "policy", "disturbance")}
     # arrays from the device may be read-only
     arrays = {name: None if array is None else np.require(array, requirements="W") for name, array in arrays.items()}
-    arrays["value"][lost] = np.inf  # they stored a finite number above all others
+    arrays["value"][lost] = np.inf  # during the iteration these nodes hold a finite number above all others
     idle = lost | np.asarray(task.obstacles.ended) | (not state.progress.has_begun)  # a guess has no policy
     for array in (arrays["policy"], arrays["disturbance"]):
         if array is not None:

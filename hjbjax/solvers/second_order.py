@@ -60,7 +60,7 @@ def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) 
     if sharp.code is not Status.CONVERGED:
         # Ctrl-C leaves the solve unfinished; after a time limit the monotone answer is complete
         code = sharp.code if sharp.code is Status.INTERRUPTED else settled.code
-        note = f"It is of first order: the second-order iteration ended {sharp.code.name}."
+        note = f"The value is of first order, since the second-order iteration ended with {sharp.code.name}."
         return settled._replace(code=code, note=note)
     contradiction = _contradiction(settled, sharp, clock)
     return sharp if contradiction is None else settled._replace(note=contradiction)
@@ -85,6 +85,6 @@ def _contradiction(settled: Settled, sharp: Settled, clock: Clock) -> str | None
     if moved <= explained + float(settled.task.tol):
         return None
     return (
-        f"It is of first order: the second-order answer differs from this certified one by up to {moved:.3g}, of which "
-        f"the grid explains {explained:.3g}."
+        f"The value is of first order, since the second-order answer differs from this certified one by up "
+        f"to {moved:.3g}, of which the grid explains {explained:.3g}."
     )

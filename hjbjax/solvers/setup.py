@@ -150,8 +150,8 @@ def stores_links(on: Discretisation) -> bool:
 def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Standstill | None) -> Scalar | None:
     """A lower bound on all values: the least payment at the end of a run, if no action earns before it.
 
-    None if the costs of resting were not computed. The least finite number if something can be earned, a condition that
-    may be traced.
+    None if the costs of resting were not computed. If an action can earn something there is no such bound, and the
+    result is the least finite number; a traced problem decides this at run time.
     """
     if still is None or is_constrained(on.problem):
         return None
@@ -189,8 +189,8 @@ class Assumptions:
     Attributes:
       certificate: the applicable error bound.
       exact: True if the minimum over the actions is exact; otherwise there are no bounds.
-      may_rest: True if rest points at zero cost close the problem (no discount, no constraint).
-      costs_certify: True if without discount a positive running cost gives a bound.
+      may_rest: True if only rest points at zero cost can make the value finite (no discount, no constraint).
+      costs_certify: True if a positive running cost gives a bound although there is no discount.
     """
 
     certificate: Certificate

@@ -249,7 +249,7 @@ class Rows(NamedTuple):
     lanes: np.ndarray  # the lane of each row; −1 in padding rows
     tasks: Task
     states: State
-    before: np.ndarray  # the evaluations of each row before the last chunk
+    before: np.ndarray  # number of evaluations of each row before the last chunk
 
 
 class LanesRun:

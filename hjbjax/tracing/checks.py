@@ -270,7 +270,7 @@ def function_of(function: Callable, name: str, wanted: tuple[int, ...], **fed: t
       **fed: the shapes of its arguments, by name.
 
     Raises:
-      ValueError: with the result, or the reason why it cannot be traced.
+      ValueError: the message shows the wrong result, or the reason why the function cannot be traced.
     """
     said_call = f"{name}({', '.join(fed)})"
     with own_settings(x64=True):

@@ -231,7 +231,7 @@ class Marked:
         return found
 
     def _key(self) -> tuple[object, object]:
-        """The values by which it is compared."""
+        """The values that ``==`` and ``hash`` compare."""
         return (code(self.__wrapped__) if self.whole else self.__wrapped__), self.mark
 
     def __eq__(self, other: object) -> bool:
@@ -327,7 +327,7 @@ def _settled_outside(function: Partial, shapes: Sequence[tuple[int, ...]]) -> Pa
 
 
 def _settled_inside(function: Partial, shapes: Sequence[tuple[int, ...]], dtype: DType) -> Partial:
-    """A function inside a JAX transformation: with a mark, or with the numbers it closes over as leaves."""
+    """A function used inside a JAX transformation, marked if possible, else with its closed-over numbers as leaves."""
     function = _bare(function)
     mark = identity(function)
     if mark is not None:

@@ -249,7 +249,7 @@ class _Polynomials:
         return None  # sets of terms are stored per entry, and are cheap
 
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
-        # not by the terms of ``inner``: its derivative rule may differ from the derivative of its computation
+        # the terms of ``inner`` do not count: the derivative rule may differ from the derivative of its computation
         return self.nodewise(eqn, operands)
 
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:

@@ -144,7 +144,8 @@ def reached(
     Args:
       on: the chain.
       held: bool (*grid), the nodes to reach.
-      surely: compute the nodes that reach them with probability one; otherwise both sets are the larger one.
+      surely: also compute the nodes that reach them with probability one; otherwise both sets in the result are the
+        nodes that may reach them.
       least: a rate per unit time; jumps at rates up to it count as rounding.
       clock: the limits; raises ``Stopped`` when they are exceeded.
     """

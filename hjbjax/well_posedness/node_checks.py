@@ -145,7 +145,7 @@ def _faulty_pushes(on: Discretisation) -> dict[str, jax.Array]:
         found = found.outside(on.level <= 0)
     amiss = functools.reduce(jnp.logical_or, (~(cost > -jnp.inf) for cost in found.costs))
     size = jnp.max(jnp.stack([jnp.max(jnp.where(jnp.isfinite(cost), jnp.abs(cost), 0)) for cost in found.costs]))
-    # a round trip that costs nothing up to rounding also earns with these lower costs, and the cheapest path is endless
+    # lower all costs by more than rounding: a free round trip then earns, and repeating it has no cheapest path
     lower = altered(found, costs=tuple(cost - FREE * jnp.finfo(on.dtype).eps * size for cost in found.costs))
     value = lower.cheapest(jnp.zeros(on.grid.shape, on.dtype))
     return {"number": amiss, "free": ~amiss & (lower.least(value) < value)}
@@ -180,7 +180,7 @@ def _representatives(admissible: sets.AdmissibleSet | None, most: int) -> np.nda
 
 
 def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock: Clock) -> bool:
-    """True if ``check_values`` refuses nothing; evaluates some actions at a time."""
+    """True if ``check_values`` refuses nothing; evaluates the actions in batches."""
     count, some = len(actions[0]), max(1, LOOK // on.grid.size)
     # In batches of about a second, as ten million nodes and 33 actions take half a minute. All batches use one program,
     # because first and last are arguments.
@@ -360,7 +360,7 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
     ingredient = getattr(problem, name)
     # a constant is wrong everywhere, so no node is named
     if not callable(ingredient):
-        cure = "; a number larger than any V forbids a set, such as 1e3" if name == "exit_cost" else ""
+        cure = "; to forbid a set, use a number larger than any V, such as 1e3" if name == "exit_cost" else ""
         word = problem.labels.word(name)
         raise ValueError(f"Problem.{word}: got {np.asarray(ingredient)}, wanted finite numbers{cure}")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
@@ -368,7 +368,7 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
         f"{call(problem, name)} is NaN or infinite at {where}.\n"
         "Keep the singularity out of the box (lo, hi) or between nodes (shape), or define the function there:\n"
         "jnp.where(bad, finite, f(jnp.where(bad, safe_x, x)))"
-        + ("\nA number larger than any V forbids a set, such as 1e3" if name == "exit_cost" else "")
+        + ("\nTo forbid a set, use a number larger than any V, such as 1e3" if name == "exit_cost" else "")
     )
 
 

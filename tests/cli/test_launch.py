@@ -71,7 +71,7 @@ def _no_child(monkeypatch):
         (("--", "solve", "pendulum", "--devices", "3"), "3 devices cannot be the same number in each of 2 processes"),
         (("--processes", "30", "--", "solve", "bang-bang", "--shape", "41"), "at most 13 parts"),
         (("--processes", "90", "--", "solve", "pendulum"), "the 200 points of axis 0 into 90 parts"),
-        (("--", "solve", "bang-bang", "--devices", "2x1"), "mesh has 2 axes, (2, 1), the grid 1"),
+        (("--", "solve", "bang-bang", "--devices", "2x1"), "got a mesh of 2 axes, (2, 1), wanted at most 1"),
         (("--", "solve", "pendulm"), "did you mean 'pendulum'?"),
         (("--", "solve", "pendulum", "--tol", "nan"), "got 'nan', wanted a finite number > 0"),
         (("--", "solve"), "Missing argument 'NAME'"),

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import pkgutil
 import re
 from pathlib import Path
 
@@ -33,6 +34,12 @@ def test_it_is_short():
 def test_ci_runs_the_test_command_as_it_stands_here():
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     assert f'tests="{COMMANDS[1]}"' in script.splitlines()
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_public_name_on_a_page_exists(page):
+    for name in set(re.findall(r"\bhjb(?:jax)?((?:\.[a-zA-Z]\w*)+)", PAGES[page])):
+        assert pkgutil.resolve_name(f"hjbjax{name}") is not None
 
 
 def settled(text):

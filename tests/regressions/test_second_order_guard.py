@@ -55,7 +55,7 @@ def test_an_answer_that_contradicts_the_certified_one_is_not_returned(monkeypatc
     monotone = hjb.solve(problem, grid, scheme=hjb.Upwind(subcell=True))
     monkeypatch.setattr(host_solve, "second_order", slid)
     solution = hjb.solve(problem, grid)
-    assert "It is of first order: the second-order answer differs from this certified one by up to" in solution.message
+    assert "first order, since the second-order answer differs from this certified one by up to" in solution.message
     np.testing.assert_allclose(solution.value, monotone.value, atol=2e-3)
 
 

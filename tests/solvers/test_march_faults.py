@@ -46,7 +46,7 @@ LQ = hjb.Problem(plane, quadratic, Box([-3.0], [3.0]))
         ({"method": "implicit"}, TypeError, r"method is 'implicit'"),
         ({"method": hjb.Implicit(), "scheme": hjb.Weno5()}, ValueError, r"got Weno5\(.*\), wanted Upwind"),
         ({"inner": 2.0}, ValueError, r"inner = 2.0; wanted the fraction"),
-        ({"inner": 0.5}, ValueError, r"watches a Box of disturbances; got None"),
+        ({"inner": 0.5}, ValueError, r"requires disturbances in a Box; got None"),
         ({"time_limit": 0}, ValueError, r"time_limit = 0"),
         ({"dtype": "float16"}, ValueError, r"dtype: got 'float16'"),
         ({"max_memory": 100}, MemoryError, r"41 = 41 nodes need about"),

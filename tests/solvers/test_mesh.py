@@ -195,7 +195,7 @@ def test_faults(found):
 def test_refusals(found):
     wanted = {
         "no mesh": ("TypeError: solve: mesh is 8", "jax.make_mesh"),
-        "axes": ("ValueError: solve: mesh has 3 axes", "the grid 2"),
+        "axes": ("ValueError: solve: got a mesh of 3 axes", "wanted at most 2"),
         "few points": ("ValueError: solve: mesh divides the 23 points of axis 0 into 8 parts", "at most 7 parts"),
         "paths": ("ValueError: solve: SemiLagrangian", "leave out mesh"),
         "direct": ("ValueError: solve: PolicyIteration(evaluation=Direct()", "leave out mesh"),

@@ -154,7 +154,7 @@ def test_where_the_second_order_does_not_converge_the_monotone_answer_stands(fai
     solution = hjb.solve(problem, grid)
     first = hjb.solve(problem, grid, scheme=hjb.Upwind(subcell=True))
     assert solution.status is hjb.Status.CONVERGED
-    assert solution.message.endswith("It is of first order: the second-order iteration ended STALLED.")
+    assert solution.message.endswith("is of first order, since the second-order iteration ended with STALLED.")
     np.testing.assert_allclose(solution.value, first.value, rtol=1e-14, atol=1e-15)  # another program rounds otherwise
     assert solution.error == pytest.approx(first.error, rel=1e-6)
     with pytest.raises(hjb.SolveError, match="STALLED"):  # who asks for it is told

@@ -49,8 +49,12 @@ plt.show()
 # %%
 figure, ax = plt.subplots(figsize=(5.4, 4.2), layout="constrained")
 plotting.policy(solution, ax=ax)
-plotting.switching_curve(solution, ax=ax)
 plt.show()
+
+# %% [markdown]
+# The cost is quadratic in the torque, so the torque is continuous wherever $V$ is smooth, and there is no switching
+# curve. It jumps only across the two spirals on which $V$ has a kink. On one side of a spiral it is cheaper to rise
+# directly, on the other side to swing back first.
 
 # %% [markdown]
 # ## An independent answer: near upright

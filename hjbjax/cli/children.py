@@ -62,7 +62,7 @@ class End:
       number: the number of the child.
       code: its exit code; minus the number of the signal that ended it.
       words: the last line that it wrote on standard error.
-      early: True if it ended with exit code 0, but without its farewell.
+      early: True if it ended with exit code 0 without printing the farewell.
     """
 
     number: int

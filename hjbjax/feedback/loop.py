@@ -32,7 +32,7 @@ from hjbjax.tracing import checks, closures
 Event: TypeAlias = tuple[Number, State]  # a point of the path: its time and its state
 Actions: TypeAlias = tuple[Control, Disturbance | None]  # of both players; no disturbance without an opponent
 
-HALVINGS = 30  # of the path back to the last point at which the players are defined: a billionth of an interval
+HALVINGS = 30  # bisections for the last point of a path at which the players are defined: to a billionth of an interval
 STREAM = 0x6272  # folded into the key, so that the draws are independent of the Brownian path, which splits the key
 NEWTON = 3  # steps onto the boundary of the target, whose function need not be linear
 EDGE = 1e-6  # the smallest share of a step before or after a meeting; shares of 0 and 1 would give no zero inside it

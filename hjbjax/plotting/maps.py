@@ -171,7 +171,8 @@ def switching_curve(
 ) -> Picture:
     """Plot the curve on which one input changes sign: the zero level of the feedback, linear between nodes.
 
-    A bang-bang feedback jumps between two nodes, so the curve is accurate to half a cell. Over one axis the zeros are
+    A bang-bang feedback jumps between two nodes, so the curve is accurate to half a cell. A continuous feedback crosses
+    zero without a switch, and its curve is arbitrary where the feedback is nearly zero. Over one axis the zeros are
     drawn as vertical lines.
 
     Args:

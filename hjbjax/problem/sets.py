@@ -178,7 +178,7 @@ class Simplex:
     def grid(self, num: int) -> "Finite":
         """The simplex sampled with ``num`` equally spaced values per input, including 0 and the total, as a finite set.
 
-        The set has (num + m − 2)!/((num − 1)! (m − 1)!) points for m inputs, and with ``at_most`` those for m + 1.
+        The set has (num + m − 2)!/((num − 1)! (m − 1)!) points for m inputs; with ``at_most`` replace m by m + 1.
         """
         if not _is_count(num) or int(num) < 2:
             raise ValueError(f"Simplex.grid: got {num!r}, wanted an integer of at least 2: the values per input")

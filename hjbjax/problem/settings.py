@@ -10,6 +10,7 @@ Options that only log, and options that choose a device or random numbers, stay 
 """
 
 import contextlib
+import operator
 from collections.abc import Iterator
 
 import jax
@@ -63,3 +64,18 @@ def own_settings(*, x64: bool | None = None) -> Iterator[None]:
         contextlib.nullcontext() if x64 is None else jax.enable_x64(x64),
     ):
         yield
+
+
+# the options of ``own_settings`` that matter to a lookup between nodes, and their usual values
+_USUAL = {
+    "jax_debug_nans": False, "jax_debug_infs": False, "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow", "jax_check_tracer_leaks": False, "jax_disable_jit": False,
+    "jax_no_tracing": False, "jax_no_execution": False, "jax_transfer_guard_host_to_device": None,
+    "jax_transfer_guard_device_to_device": None, "jax_transfer_guard_device_to_host": None,
+}  # fmt: skip
+_options, _usual = operator.attrgetter(*_USUAL), tuple(_USUAL.values())
+
+
+def are_usual() -> bool:
+    """True with the usual options of JAX, so that a lookup between nodes need not set its own; takes a microsecond."""
+    return bool(_options(jax.config) == _usual)

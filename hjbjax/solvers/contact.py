@@ -36,9 +36,9 @@ def contact(
 
     The keys are the names of fields of a Solution.
 
-    A tie counts: it is optimal to stop where continuing costs the same. A node with an infinite ψ never stops. Paths
-    have ended at a node of the target; if V = ψ there, it belongs to the set together with a neighbour outside of the
-    target, so that the boundary of the set does not follow the boundary of the target.
+    A tie counts: it is optimal to stop where continuing costs the same. A node with an infinite ψ never stops. A
+    node of the target with V = ψ belongs to the set only if a neighbour outside of the target does. Otherwise the
+    boundary of the set would follow the boundary of the target.
 
     Args:
       problem: the problem; a set without its constraint is left out.

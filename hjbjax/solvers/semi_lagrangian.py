@@ -163,9 +163,9 @@ def replace_chain(
 ) -> Followed | None:
     """The solution on arcs, if the chain may be carried past a target that the paths of the system meet.
 
-    Without noise and discount the chain still spreads like noise of the size of a cell. At nodes where it may miss the
-    target under every policy, its expected cost is infinite on every grid, although the true cost may be finite. Arcs do
-    not spread.
+    Without noise and discount the chain still spreads like noise of the size of a cell. Where it may miss the target
+    under every policy, its expected cost is infinite on every grid, although the true cost may be finite. Arcs do not
+    spread.
 
     Args:
       on: the problem on its grid.

@@ -1,7 +1,9 @@
 """The answer: between the nodes, through transformations, and on the screen."""
 
 import base64
+import dataclasses
 import io
+import pickle
 import re
 
 import jax
@@ -270,6 +272,25 @@ def test_policies_are_called_as_in_reinforcement_learning():
     assert (control.tolist(), state) == ([2.0], "memory")
     many, _ = LINEAR.predict(np.array([[0.5, 1.0], [9.0, 1.0]]))  # the second is taken to the edge
     assert many.tolist() == [[2.0], [4.0]]
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_predict_is_control_at_for_every_kind_of_call(discrete):
+    turned = dataclasses.replace(solution_of(lambda a, b: jnp.cos(a) + b, RING), discrete=discrete)
+    x = np.array([[0.1, 0.5], [7.0, 9.0], [np.inf, 0.0], [np.nan, 0.0]])
+    wanted = turned.control_at(x, clamp=True)
+    np.testing.assert_allclose(turned.predict(x)[0], wanted, rtol=1e-13)
+    assert turned.predict(x)[0].dtype == np.float64
+    np.testing.assert_allclose(turned.predict([0, 1])[0], turned.control_at([0.0, 1.0]), rtol=1e-13)
+    with jax.debug_nans(True):  # a control may be NaN
+        np.testing.assert_allclose(turned.predict(x)[0], wanted, rtol=1e-13)
+    inside = jax.jit(lambda y: y + turned.predict(x[0])[0])(jnp.zeros(1))  # a known state in a program
+    np.testing.assert_allclose(inside, wanted[0], rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(lambda y: turned.predict(y)[0])(x[0]), wanted[0], rtol=1e-6)
+    again = pickle.loads(pickle.dumps(turned))  # after the first call, which made a program
+    np.testing.assert_allclose(again.predict(x)[0], wanted, rtol=1e-13)
+    with pytest.raises(ValueError, match=r"states of shape \(3,\)"):
+        turned.predict([1.0, 2.0, 3.0])
 
 
 def test_states_outside_are_told_of():

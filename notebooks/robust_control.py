@@ -138,10 +138,10 @@ for series, size in ((study.noise, expansion[1]), (study.gain, expansion[2])):
 #
 # ## A case without the order 2
 #
-# With the cost $|x| + \tfrac12u^2$ the first condition fails. The path comes to rest at the corner of the cost, where
-# $V'' \approx |x|^{-1/2}$ is infinite, and the integral of $\tfrac12V''$ diverges. With noise the state fluctuates around
-# the corner over a distance of order $\varepsilon^{4/3}$, which costs $\Lambda$ per unit time. Near zero the
-# substitution $V = -\varepsilon^2\log\psi$ gives Airy's equation,
+# With the cost $|x| + \tfrac12u^2$ the first condition fails. The path comes to rest at the corner of the cost,
+# where $V'' \approx |x|^{-1/2}$ is infinite, and the integral of $\tfrac12V''$ diverges. With noise the state
+# fluctuates around the corner over a distance of order $\varepsilon^{4/3}$, which costs $\Lambda$ per unit time.
+# Near zero the substitution $V = -\varepsilon^2\log\psi$ gives Airy's equation,
 #
 # $$\tfrac12\varepsilon^4\psi'' = (|x| - \Lambda)\,\psi, \qquad \Lambda = a\,(\varepsilon^4/2)^{1/3},$$
 #

@@ -5,11 +5,11 @@
     |V^ε − V| = O(ε²),   |V^γ − V| = O(γ⁻²),   and the same for the feedbacks, where V is smooth.
 
 To leading order the changes are ε² times the integral of ½ΔV, and γ⁻² times the integral of ½|E'DV|², along the optimal
-path. These integrals must exist, so the paths from the region must not meet a kink of V, and must not come to rest where
-V'' is infinite: with the cost |x| the order in ε is 4/3. The grid must resolve the change. All problems are solved on one
-grid by one scheme, so the discretisation error cancels up to its product with the change. ``Limited()`` avoids
-numerical diffusion, which would hide ε. The orders are least-squares slopes of log error over log ε and log 1/γ, for
-errors above the tolerance.
+path. These integrals must exist, so the paths from the region must not meet a kink of V, and must not come to rest
+where V'' is infinite: with the cost |x| the order in ε is 4/3. The grid must resolve the change. All problems are
+solved on one grid by one scheme, so the discretisation error cancels up to its product with the change. ``Limited()``
+avoids numerical diffusion, which would hide ε. The orders are least-squares slopes of log error over log ε and log 1/γ,
+for errors above the tolerance.
 """
 
 import dataclasses

@@ -1,5 +1,6 @@
 """Settings of Sphinx: Markdown pages, docstrings in Google's style, and figures without a network."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -40,7 +41,18 @@ html_static_path = ["static"]
 html_css_files = ["site.css"]
 
 
+# jaxtyping's types with a shape, for NumPy and for JAX; the shape is in the text
+SHAPED = re.compile(r"~?[\w.]*?(\w+)\[[\w.~]*\.Array, '([^']*)'\] \| ~?[\w.]*?\1\[[\w.~]*ndarray, '\2'\]")
+
+
+def shorten_types(app, *_):
+    """Write ``Array`` for an array of either kind in the types of arguments, before autodoc adds them to the text."""
+    for types in app.env.current_document.autodoc_annotations.values():
+        types.update({name: SHAPED.sub("Array", text) for name, text in types.items()})
+
+
 def setup(app):
     """Equations as MathML; docstrings, which are plain text, as reStructuredText before napoleon reads them."""
     mathml.add(app)
+    app.connect("object-description-transform", shorten_types, priority=400)
     app.connect("autodoc-process-docstring", prepare_docstring, priority=100)

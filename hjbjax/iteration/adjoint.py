@@ -35,7 +35,7 @@ from hjbjax.iteration.fixed_point import Task
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.settings import own_settings
-from hjbjax.problem.types import Field, Number, Scalar
+from hjbjax.problem.types import Field, Mask, Number, Scalar
 
 Map: TypeAlias = Callable[[Field], Field]  # maps node values to node values
 LinearSolve: TypeAlias = Callable[[Map, Field], Field]  # from a matrix-free product and the right-hand side
@@ -175,34 +175,46 @@ def attach_policy(task: Task, policy: Greedy, value: Field) -> Greedy:
       policy: the policy of the solution of the same task.
       value: the value with derivatives, from ``attach``.
     """
-    frozen, policy = jax.lax.stop_gradient((task, policy))
-    return _moving(policy, task.on, value, frozen)
+    acting = task.counted & ~task.obstacles.ended
+    controls, disturbances = attach_actions(task.on, (policy.controls, policy.disturbances), value, acting, task.lost)
+    return Greedy(jax.lax.stop_gradient(policy.defect), controls, disturbances)
+
+
+def attach_actions(on: Discretisation, pair: Any, value: Field, acting: Mask, lost: Mask | None = None) -> Any:
+    """The optimal actions of both players, their numbers unchanged, as differentiable functions of V and of ``on``.
+
+    Args:
+      on: the problem on its grid, with its tracers.
+      pair: the components of the control and of the disturbance, each (*grid).
+      value: V with derivatives.
+      acting: the nodes at which an action is taken; the others have no derivative.
+      lost: the nodes to which no action may lead.
+    """
+    return _moving(*jax.lax.stop_gradient((pair, acting, lost)), on, value)
 
 
 @jax.custom_jvp
-def _moving(policy: Greedy, on: Discretisation, value: Field, task: Task) -> Greedy:
-    """``policy``, with the derivative of the optimum of the Hamiltonian; computed on demand."""
-    return policy
+def _moving(pair: Any, acting: Mask, lost: Mask | None, on: Discretisation, value: Field) -> Any:
+    """``pair``, with the derivative of the optimum of the Hamiltonian; computed on demand."""
+    return pair
 
 
 @_moving.defjvp
 @own_settings()
-def _moving_tangent(primals: Any, tangents: Any) -> tuple[Greedy, Greedy]:
-    """The policy, and its tangent at the nodes where an action is taken."""
-    policy, on, value, task = primals
+def _moving_tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """The actions, and their tangents at the nodes where an action is taken."""
+    pair, acting, lost, on, value = primals
 
-    def actions(on: Discretisation, value: Field) -> Greedy:
-        moved = sensitivity.actions(on, value, task.lost, list(policy.controls), list(policy.disturbances))
-        acting = task.counted & ~task.obstacles.ended
-        controls, disturbances = (
-            tuple(jnp.where(acting, jnp.asarray(new, kept.dtype), kept) for kept, new in zip(*pair, strict=True))
-            for pair in zip((policy.controls, policy.disturbances), moved, strict=True)
+    def actions(on: Discretisation, value: Field) -> Any:
+        moved = sensitivity.actions(on, value, lost, *map(list, pair))
+        return tuple(
+            tuple(jnp.where(acting, jnp.asarray(new, kept.dtype), kept) for kept, new in zip(*each, strict=True))
+            for each in zip(pair, moved, strict=True)
         )
-        return Greedy(policy.defect, controls, disturbances)
 
-    moved = jax.jvp(actions, (on, value), tangents[1:3])[1]
+    moved = jax.jvp(actions, (on, value), tangents[3:])[1]
     zero = once((on, value), "a feedback")
-    return policy, jax.tree.map(lambda entry: entry + zero.astype(entry.dtype), moved)
+    return pair, jax.tree.map(lambda entry: entry + zero.astype(entry.dtype), moved)
 
 
 def _chain_product(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:

@@ -20,7 +20,7 @@ from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.discretisation.posing import with_horizon
 from hjbjax.discretisation.schemes import Limited, Upwind
 from hjbjax.hamiltonian import exact
-from hjbjax.iteration import bellman, time_stepping
+from hjbjax.iteration import adjoint, bellman, time_stepping
 from hjbjax.iteration.evaluation import check_choice
 from hjbjax.iteration.time_methods import Explicit, TimeMethod
 from hjbjax.iteration.time_stepping import March
@@ -482,7 +482,8 @@ def _march_traced(
         (value, ok), count = time_stepping.repeat(task, value, begin, end, steps), count + steps
         fine &= ok & jnp.all(jnp.isfinite(value))
         values.append(value)
-        actions.append(time_stepping.greedy_actions(task, value, end))
+        pair = time_stepping.greedy_actions(task, value, end)
+        actions.append(adjoint.attach_actions(on.at(end), pair, value, jnp.logical_not(task.obstacles_at(end).ended)))
         touching.append(contact(problem, grid, task.obstacles_at(end), value))
     u, d = (
         jnp.stack(

@@ -54,3 +54,23 @@ def test_memory_grows_like_the_square_root_of_the_steps():
     least = bytes_of(100)
     assert bytes_of(1600) < 4 * least
     assert bytes_of(6400) < 8 * least
+
+
+def searched(weight):
+    """The control at a node, and at a marched time, of a cost whose optimum has no formula."""
+    problem = hjb.Problem(
+        lambda x, u: u, lambda x, u: x @ x + jnp.cosh(u[0]), hjb.Box([-3.0], [3.0]),
+        terminal_cost=lambda x: weight * x @ x,
+    )  # fmt: skip
+    marched = hjb.march(problem, hjb.Grid([-1.0], [1.0], (9,)), 0.2, scheme=hjb.Upwind(), step=0.02, times=(0.0, 0.1))
+    return marched.policy[:, 6, 0]
+
+
+@pytest.mark.slow
+def test_a_searched_control_has_the_derivative_of_the_value():
+    with jax.enable_x64(True):
+        run = jax.jit(searched)
+        found = jax.jit(jax.jacrev(searched))(1.0)
+        wanted = (run(1.0 + 1e-4) - run(1.0 - 1e-4)) / 2e-4
+    assert np.min(np.abs(wanted)) > 0.1
+    np.testing.assert_allclose(found, wanted, rtol=1e-3)

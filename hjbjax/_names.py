@@ -11,6 +11,7 @@ from hjbjax.applications.l2_gain import attenuation, saturation
 from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, from_hj_reachability, reach, reach_avoid
+from hjbjax.applications.transitions import Transition, transition
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
@@ -81,6 +82,7 @@ __all__ = [
     "Status",
     "Sweeps",
     "Tableau",
+    "Transition",
     "Upwind",
     "ValueIteration",
     "Weno5",
@@ -117,5 +119,6 @@ __all__ = [
     "solve_batch",
     "stability",
     "stay_probability",
+    "transition",
     "zoo",
 ]

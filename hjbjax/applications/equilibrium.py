@@ -194,18 +194,23 @@ def _check(problem_of: Any, grid: Any, excess: Any, bracket: Any) -> Any:
             raise TypeError(f"equilibrium: {name} is {arguments.shown(function)}; wanted a function")
     if not isinstance(grid, Grid):
         raise TypeError(f"equilibrium: got {arguments.shown(grid)}; wanted a Grid")
+    return check_bracket(bracket, "equilibrium")
+
+
+def check_bracket(bracket: Any, name: str) -> Any:
+    """The two ends of a bracket, shape (2,); ``name`` is the function that the user called."""
     wanted = "wanted two finite prices lo < hi, such as (0.0, 0.05)"
     if is_traced(bracket):
         ends = jnp.stack([*bracket]) if isinstance(bracket, (tuple, list)) else bracket
         if np.shape(ends) != (2,):
-            raise ValueError(f"equilibrium: the bracket has shape {np.shape(ends)}; {wanted}")
+            raise ValueError(f"{name}: the bracket has shape {np.shape(ends)}; {wanted}")
         return ends
     try:
         ends = np.asarray(bracket, np.float64)
     except (TypeError, ValueError):
         ends = np.zeros(0)
     if ends.shape != (2,) or not np.all(np.isfinite(ends)) or ends[0] >= ends[1]:
-        raise ValueError(f"equilibrium: the bracket is {arguments.shown(bracket)}; {wanted}")
+        raise ValueError(f"{name}: the bracket is {arguments.shown(bracket)}; {wanted}")
     return ends
 
 

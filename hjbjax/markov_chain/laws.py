@@ -22,7 +22,7 @@ one sparse linear solve, transposed in reverse mode. With the rank-one term Λ �
 """
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,10 @@ from hjbjax.problem.host_calls import call_on_host
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Field, Number
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+    from scipy.sparse.linalg import SuperLU
 
 ROUNDING = 1e-12  # relative amount by which a time may exceed the horizon
 LONGEST = {8: 400.0, 4: 60.0}  # mean jumps per block, by the bytes of a number: e^-400 and e^-60 are normal numbers
@@ -103,18 +107,18 @@ def _increasing(given: Any, name: str) -> np.ndarray:
     return times
 
 
-def check_law(law: Any, grid: Grid) -> np.ndarray:
-    """A law of known numbers, in float64.
+def check_law(law: Any, grid: Grid, name: str = "evolve") -> np.ndarray:
+    """A law of known numbers, in float64; ``name`` is the function that the user called.
 
     Raises:
       ValueError: not one finite non-negative number per node.
     """
     found = np.asarray(law, np.float64)
     if found.shape != grid.shape:
-        raise ValueError(f"evolve: got a law of shape {found.shape}, wanted {grid.shape}: one probability per node")
+        raise ValueError(f"{name}: got a law of shape {found.shape}, wanted {grid.shape}: one probability per node")
     if not np.all(np.isfinite(found)) or np.any(found < 0):
         count = int(np.sum(~(np.isfinite(found) & (found >= 0))))
-        raise ValueError(f"evolve: the law is negative or not finite at {count} nodes; wanted probabilities")
+        raise ValueError(f"{name}: the law is negative or not finite at {count} nodes; wanted probabilities")
     return found
 
 
@@ -159,6 +163,23 @@ def after_duration(jumps: Rates, grid: Grid, law: Field, duration: Number) -> Fi
     # thousands of products may change the sum by thousands of roundings
     before, after = jnp.sum(law), jnp.sum(found)
     return found * jnp.where(after > 0, before / jnp.where(after > 0, after, 1), 1)
+
+
+def generator(jumps: Rates, grid: Grid) -> "csr_array":
+    """The generator of known rates as a sparse matrix; host level."""
+    return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid, jumps.landings)
+
+
+def implicit_step(jumps: Rates, grid: Grid, duration: float) -> "SuperLU":
+    """The factors of 1 − t𝓛* on the host, whose ``solve`` keeps a law non-negative and its sum; one step of Euler.
+
+    The matrix is an M-matrix that is diagonally dominant by columns, so it is factored without pivoting.
+    """
+    from scipy.sparse import eye_array
+    from scipy.sparse.linalg import splu
+
+    matrix = (eye_array(grid.size) - duration * generator(jumps, grid).T).tocsc()
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 @jax.custom_jvp
@@ -216,4 +237,4 @@ def _generator(jumps: Rates, grid: Grid, leaves: tuple[np.ndarray, ...]) -> Any:
     """The generator of ``jumps`` with these numbers as its leaves, on the host."""
     numbers = [leaf.astype(np.float64) if leaf.dtype.kind == "f" else leaf for leaf in map(np.asarray, leaves)]
     known = jax.tree.unflatten(jax.tree.structure(jumps), numbers)
-    return stencil.sparse(known.offsets, known.values, -known.total(), grid, known.landings)
+    return generator(known, grid)

@@ -14,7 +14,7 @@ from systems import SEEDS, SHAPES, random_grid, random_problem
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.rates import jump_rates
 from hjbjax.discretisation.schemes import Upwind
-from hjbjax.markov_chain import chain
+from hjbjax.markov_chain import chain, policy_rates
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
@@ -233,9 +233,9 @@ def test_the_chain_stays_on_the_target_and_where_there_is_no_action():
 def test_an_equal_scheme_compiles_nothing_new():
     problem, grid = Problem(lambda x, u: u, None, UNIT, noise=1.0), Grid([0.0], [1.0], (3,))
     chain.matrix(problem, grid, np.ones((3, 1)), scheme=Upwind(central=False))
-    compiled = chain._evaluate._cache_size()
+    compiled = policy_rates._evaluate._cache_size()
     chain.matrix(problem, grid, np.zeros((3, 1)), scheme=Upwind(central=False))
-    assert chain._evaluate._cache_size() == compiled
+    assert policy_rates._evaluate._cache_size() == compiled
     assert Upwind() != Upwind(central=False)
 
 

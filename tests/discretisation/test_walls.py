@@ -153,7 +153,10 @@ def test_diagonal_jumps_reflect_to_second_order(correlation, scheme):
     assert order_of(errors) >= 1.8
 
 
-@pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Limited(), hjb.Eno2(), hjb.Weno5()])
+SLOWLY = [pytest.param(scheme, marks=pytest.mark.slow) for scheme in (hjb.Limited(), hjb.Eno2())]
+
+
+@pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Weno5(), *SLOWLY])
 def test_heat_between_two_walls(scheme):
     """−V_t = ½σ²V″: cos πx decays at the rate π²σ²/2."""
     errors = []

@@ -43,7 +43,7 @@ def assert_bounds_hold(found, exact, tol):
     assert np.max(np.abs(found.value - exact)) <= found.error + slack
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_random_problems_agree_with_dense_linear_algebra(count):
     for seed in range(8):
         one, growth, exact = drawn(seed, (7,), count)
@@ -78,6 +78,7 @@ def quadratic(slope=0.3, level=0.1, discount=0.6, **others):
     )
 
 
+@pytest.mark.slow
 def test_the_minimum_over_a_box_stays_exact_if_growth_is_affine():
     found = hjb.solve(quadratic(), GRID, scheme=CHAIN, tol=1e-8)
     actions = hjb.Finite(np.linspace(-1, 1, 401)[:, None])

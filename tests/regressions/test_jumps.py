@@ -98,6 +98,7 @@ def falling(rate, depth, **others):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", [CHAIN, pytest.param(None, marks=pytest.mark.slow)], ids=["chain", "default"])
 def test_derivatives_are_those_of_differences(scheme):
     grid = hjb.Grid([0.0], [2.0], (41,))
@@ -115,7 +116,9 @@ def test_derivatives_are_those_of_differences(scheme):
     assert np.allclose(backward, forward, rtol=1e-9)
 
 
-@pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()], ids=["explicit", "implicit"])
+@pytest.mark.parametrize(
+    "method", [hjb.Explicit(), pytest.param(hjb.Implicit(), marks=pytest.mark.slow)], ids=["explicit", "implicit"]
+)
 def test_a_march_without_choice_is_a_matrix_exponential(method):
     problem = hjb.Problem(
         lambda x, u: -0.5 * x, lambda x, u: x[0] ** 2, noise=0.3, discount=0.1, terminal_cost=lambda x: x[0],
@@ -209,6 +212,7 @@ def test_linear_value_with_jumps_and_open_ends_is_exact():
         assert np.allclose(found.value, exact, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_crash_lowers_the_share_of_a_fund_as_its_equation_says():
     # V is linear in the logarithm of wealth; 0.05 − 0.04 u = 0.1 · 0.3/(1 − 0.3 u)
     problem = hjb.Problem(
@@ -325,6 +329,7 @@ def test_files_and_costs_in_rewards(tmp_path):
     assert np.array_equal(hjb.load(tmp_path / "jumps.npz").value, spent.value)
 
 
+@pytest.mark.slow
 def test_rewards_of_jumps_are_minus_costs():
     grid, sale = hjb.Grid([0.0], [2.0], (21,)), {"controls": hjb.Box([0.0], [1.0]), "discount": 0.5}
     drift, land = lambda x, u: u - 0.1 * x, lambda x, u: 0.5 * x
@@ -351,6 +356,7 @@ def test_a_discount_and_bounds_of_the_state_that_are_constant_change_nothing(cha
     assert np.allclose(first, second, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_dividends_of_an_insurer_are_those_of_the_best_barrier():
     # claims of one size; dividends at once; every barrier is one linear system, and the best is found by trying all
     premium, spread, rate, claim, beta = 0.8, 0.3, 0.4, 0.7, 0.1

@@ -109,6 +109,7 @@ def plant(rates, price=0.9, **others):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", [CHAIN, pytest.param(None, marks=pytest.mark.slow)], ids=["chain", "default"])
 def test_derivatives_are_those_of_differences(scheme):
     def values(rate):
@@ -123,7 +124,9 @@ def test_derivatives_are_those_of_differences(scheme):
     assert np.allclose(backward, forward, rtol=1e-10)
 
 
-@pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()], ids=["explicit", "implicit"])
+@pytest.mark.parametrize(
+    "method", [hjb.Explicit(), pytest.param(hjb.Implicit(), marks=pytest.mark.slow)], ids=["explicit", "implicit"]
+)
 def test_a_march_without_choice_is_a_matrix_exponential(method):
     rates = np.array([[0.0, 0.7, 0.2], [0.0, 0.0, 1.5], [0.4, 0.3, 0.0]])
     problem = hjb.Problem(
@@ -182,6 +185,7 @@ def altered(problem, modes):
     )
 
 
+@pytest.mark.slow
 def test_rewards_are_minus_costs_and_switching_costs_are_paid_from_them():
     one = random_modes.draw(1)
     costs = random_modes.problem(one)
@@ -229,6 +233,7 @@ def test_a_target_is_reached_by_changing_the_mode():
     assert np.all(found.switching[1] == 1)
 
 
+@pytest.mark.slow
 def test_a_game_with_modes():
     def drift(x, u, d, mode):
         return u + (0.5, 0.2)[mode] * d
@@ -290,6 +295,7 @@ def test_files_keep_the_modes(solved, tmp_path):
     assert "modes calm, wild x x1: 2 x 101 = 202 nodes" in str(again)
 
 
+@pytest.mark.slow
 def test_a_path_changes_its_mode_where_that_is_optimal(solved):
     problem, found = solved
     where = np.flatnonzero(found.switching[1] == 0)
@@ -305,6 +311,7 @@ def test_a_path_changes_its_mode_where_that_is_optimal(solved):
         hjb.simulate(problem, found, [start], 2.0, key=0)
 
 
+@pytest.mark.slow
 def test_random_changes_have_their_law():
     # no motion: the number of changes and the share of time in a mode are those of the two-state chain
     rates = np.array([[0.0, 0.7], [1.3, 0.0]])
@@ -407,6 +414,7 @@ def drifting(modes, **others):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_probabilities_count_random_changes_of_the_mode():
     # from the last node before the target the drive moves on at the rate 1/h or breaks down at the rate λ, for good
     grid, rate = hjb.Grid([-1.0], [1.0], (7,)), 0.2
@@ -420,6 +428,7 @@ def test_probabilities_count_random_changes_of_the_mode():
     assert np.allclose(driving.value[0, 1], np.exp(-rate), rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_feedback_sees_the_changes_of_the_mode():
     # nothing moves until the mode changes into the target: E τ = 1/λ(u)
     problem = hjb.Problem(
@@ -480,6 +489,7 @@ def test_states_without_a_mode_or_with_an_unknown_one_are_refused(solved):
             found.value_at([number, 0.3])
 
 
+@pytest.mark.slow
 def test_a_convergence_study_compares_every_mode():
     problem = dataclasses.replace(plant([[0, 0.5], [0.8, 0]]), noise=0.5)
     grids = [hjb.Grid([-2.0], [2.0], (n,)) for n in (5, 9, 17)]
@@ -489,6 +499,7 @@ def test_a_convergence_study_compares_every_mode():
     assert np.all(np.diff(study.errors) < 0)
 
 
+@pytest.mark.slow
 def test_no_change_leads_to_a_mode_that_never_arrives():
     problem = hjb.Problem(
         lambda x, u, mode: (u, 0 * u)[mode], lambda x, u, mode: 1.0, hjb.Box([-1.0], [1.0]),

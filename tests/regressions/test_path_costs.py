@@ -180,6 +180,7 @@ def test_a_promise_that_is_never_kept_is_a_warning():
         hjb.simulate(problem, solution, [-0.5, 0.0], 999.0)
 
 
+@pytest.mark.slow
 def test_a_value_that_is_wrong_is_a_promise_that_is_broken():
     problem, grid = hjb.zoo.eikonal(shape=(21, 21))
     solution = hjb.solve(problem, grid)

@@ -144,6 +144,7 @@ def test_costs_that_depend_on_time_are_paid_at_their_time():
     assert found.pushing[2, 1:].all()
 
 
+@pytest.mark.slow
 def test_a_push_may_lead_to_a_target_without_discount():
     problem = hjb.Problem(
         lambda x, u: u, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=lambda x: x[0], exit_cost=0.25,
@@ -157,6 +158,7 @@ def test_a_push_may_lead_to_a_target_without_discount():
     assert np.allclose(alone.value, 0.25 + x, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_pushes_and_changes_of_the_mode_work_together():
     problem = hjb.Problem(
         lambda x, u, mode: 0 * x, lambda x, u, mode: (4.0, 1.0)[mode] * x[0], discount=0.5,
@@ -193,6 +195,7 @@ def test_a_game_has_the_value_of_its_worst_case():
     assert found.pushing[-4:-1, 0].all()
 
 
+@pytest.mark.slow
 def test_single_precision_and_the_second_order_scheme():
     single = hjb.solve(firm(), LINE, dtype=np.float32, tol=1e-4)
     double = hjb.solve(firm(), LINE, tol=1e-9)

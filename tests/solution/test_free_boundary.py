@@ -216,6 +216,7 @@ def test_where_a_running_maximum_is_attained(method):
     assert marched.active[0][x > 1.7].all()
 
 
+@pytest.mark.slow
 def test_where_the_maximum_exceeds_the_price_nobody_stops():
     both = hjb.Problem(
         lambda x, u: u, controls=hjb.Box([-1.0], [1.0]), stopping_cost=lambda x: jnp.abs(x[0]) - 1.0,

@@ -39,8 +39,7 @@ def box(dim):
 
 
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("dim", [1, 2])
-@pytest.mark.parametrize("noise", [None, 0.3])
+@pytest.mark.parametrize(("dim", "noise"), [(1, 0.3), (2, None), pytest.param(2, 0.3, marks=pytest.mark.slow)])
 def test_a_solve_traces_the_drift_at_most_three_times(dim, noise, dtype):
     drift = Counted(pendulum)
     solution = hjb.solve(question(drift, controls=box(dim), noise=noise), GRID, dtype=dtype, scheme=hjb.Upwind())

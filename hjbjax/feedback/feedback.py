@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,21 +19,24 @@ import numpy as np
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
+from hjbjax.discretisation.posing import for_solvers
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.mode_axis import without_modes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_jax, as_partial, cast, front_door, is_traced, pytree_dataclass
-from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import bounds_at, control_of, in_unit_box
 from hjbjax.problem.types import Array, Costate, DType, Number, Numbers, State
 from hjbjax.solution.interpolation import extended
+from hjbjax.solution.modes import states_in_mode
 from hjbjax.solution.rewards import in_costs
 from hjbjax.solution.solution import Solution
 from hjbjax.tracing.closures import settled, settled_function
+from hjbjax.tracing.dependence import influence
 
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
@@ -178,17 +181,17 @@ class GreedyFeedback:
     solution: Solution
     bounds: Callable | None = None
 
-    def __call__(self, *where: Place) -> Array:
+    def __call__(self, *where: Place, mode: str | int | None = None) -> Array:
         """The control, shape (m,); outside the grid the control of its nearest point."""
-        return self.control_at(*where, clamp=True)
+        return self.control_at(*where, mode=mode, clamp=True)
 
-    def control_at(self, *where: Place, clamp: bool = False) -> Array:
+    def control_at(self, *where: Place, mode: str | int | None = None, clamp: bool = False) -> Array:
         """The minimising control, shape ``x.shape[:-1] + (m,)``; arguments and errors as for a Solution."""
-        return self._ask(where, clamp)[0]
+        return self._ask(where, mode, clamp)[0]
 
-    def disturbance_at(self, *where: Place, clamp: bool = False) -> Array:
+    def disturbance_at(self, *where: Place, mode: str | int | None = None, clamp: bool = False) -> Array:
         """The maximising disturbance, shape ``x.shape[:-1] + (l,)``."""
-        return self._ask(where, clamp)[1]
+        return self._ask(where, mode, clamp)[1]
 
     @property
     def grid(self) -> Grid:
@@ -210,9 +213,15 @@ class GreedyFeedback:
         """Not None in a game: the disturbances of the solution at the nodes, which are not interpolated here."""
         return self.solution.disturbance
 
-    def _ask(self, where: tuple[Place, ...], clamp: bool) -> tuple[Array, Array]:
+    def _ask(self, where: tuple[Place, ...], mode: str | int | None, clamp: bool) -> tuple[Array, Array]:
         """Both players' actions: float64 NumPy arrays for concrete data, otherwise in the tracer's dtype."""
+        if mode is not None:
+            x: Any = where[-1]
+            where = (*where[:-1], states_in_mode(self.grid, x, mode, "greedy_feedback"))
         costate = self.solution.costate_at(*where, clamp=clamp)  # also checks the state
+        if self.grid.modes:  # V has no slope along the modes
+            xp: Any = jnp if is_traced(costate) else np
+            costate = xp.concatenate([xp.zeros_like(costate[..., :1]), costate], axis=-1)
         own = dataclasses.replace(self, solution=_node_values(self.solution))
         if is_traced(costate, own):  # float64 must not be switched on in the middle of a caller's trace
             with own_settings():
@@ -231,6 +240,9 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
     jumps. The minimiser's path costs V, up to the error of V. For the double integrator on 101 x 101 nodes, where V is
     off by a fifth, it is no better than interpolation; with exact V its time is seven times closer to the minimum.
 
+    Modes and jumps add Σ λ (V(y) − V + c) to the minimised function, with V after the change from the solution. Pushes
+    and changes of the mode by choice are not controls; ``simulate`` takes them from the solution.
+
     Where the control jumps, pass a sampling interval ``hold=`` to ``simulate``. The control then changes only at the
     samples, and a path attracted by a switching curve follows it in a zigzag as wide as a sample. Without a hold an
     adaptive step is cut at every crossing, thousands of times. In the cells at a constrained end the feedback is the
@@ -241,12 +253,13 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
       solution: the result of ``solve`` or ``march``.
 
     Returns:
-      A function of the state, or of (t, x) if the solution was marched. It is a pytree, supports ``jit`` and ``vmap``,
-      and can be used wherever a feedback is accepted, for example in ``simulate``.
+      A function of the state, or of (t, x) if the solution was marched, with the keyword ``mode`` if there are modes.
+      It is a pytree, supports ``jit`` and ``vmap``, and can be used like any feedback, as in ``simulate``.
 
     Raises:
       TypeError: an argument that is not a Problem or not a Solution.
-      ValueError: a problem without controls, or a solution with another number of states.
+      ValueError: a problem without controls, a solution with another number of states or other modes, or jumps to
+        states that depend on the control.
 
     Example:
       >>> import hjbjax as hjb
@@ -259,10 +272,17 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
         raise TypeError(f"greedy_feedback: got {type(problem).__name__}, wanted a Problem")
     if not isinstance(solution, Solution):
         raise TypeError(f"greedy_feedback: got {type(solution).__name__}, wanted a Solution")
+    names = () if problem.modes is None else problem.modes.names
+    if names != solution.grid.modes:
+        raise ValueError(
+            f"greedy_feedback: got a problem with the modes {names!r} and a solution with {solution.grid.modes!r}; "
+            "wanted the same modes"
+        )
+    problem = for_solvers(problem, without_modes(solution.grid).ndim)
     bounds = problem.controls if callable(problem.controls) else None
     if bounds is not None:
         bounds = settled_function(bounds, *problem.state_arguments((solution.grid.ndim,), ()))
-    problem = in_unit_box(costs_of(problem), solution.grid.ndim)
+    problem = in_unit_box(problem, solution.grid.ndim)
     if problem.controls is None:
         raise ValueError("greedy_feedback: problem.controls is None, so that there is nothing to choose")
     wanted = (*np.shape(solution.times), *solution.grid.shape)
@@ -271,7 +291,13 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
     m = np.shape(solution.policy)[-1:] if solution.policy is not None else (problem.controls.dim,)
     if m != (problem.controls.dim,) or (problem.is_game and solution.disturbance is None):
         raise ValueError("greedy_feedback: the solution belongs to another problem; its players differ")
-    return GreedyFeedback(settled(problem, solution.grid.ndim), in_costs(solution), bounds)
+    problem = settled(problem, solution.grid.ndim)
+    if not influence(problem, solution.grid.ndim, np.dtype(np.float64)).landing.is_constant:
+        raise ValueError(
+            "greedy_feedback: got jumps whose landing depends on an action, so V would be interpolated for every "
+            "action\nthat is tried; pass the solution itself as the feedback: it interpolates the controls of the nodes"
+        )
+    return GreedyFeedback(problem, in_costs(solution), bounds)
 
 
 def _minimax(greedy: GreedyFeedback, where: tuple, costate: Array) -> tuple[Array, Array]:
@@ -313,12 +339,14 @@ def _at(greedy: GreedyFeedback, when: tuple[Number, ...], x: State, p: Costate) 
     # D²V uses V one mean cell away, also on a stretched axis, because the nodes resolve nothing finer
     widths = [jnp.asarray(grid.spacing(axis), x.dtype) for axis in range(n)]
     h = jnp.stack([jnp.mean(width) for width in widths])
-    # without noise D²V is not needed, so zeros replace V at the 3^n nodes
+    # without noise and growth V is not needed, so zeros replace it at the 3^n nodes
     value, bends = jnp.zeros((3,) * n, x.dtype), (jnp.zeros((), x.dtype),) * n
+    look = functools.partial(greedy.solution.value_at, *when, clamp=True)
+    if problem.growth is not None:
+        value = value + look(x)
     if problem.noise is not None:
         steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * n, indexing="ij"), axis=-1)
         points = _reflected(jnp.asarray(x + h * steps), grid)
-        look = functools.partial(greedy.solution.value_at, *when, clamp=True)
         value = beyond_ends(look, points, grid, continuing_sides(grid))
         center = (1,) * n
         # D⁺ − D⁻ along every axis, the second difference times h, which is how the Hamiltonian takes noise
@@ -330,13 +358,30 @@ def _at(greedy: GreedyFeedback, when: tuple[Number, ...], x: State, p: Costate) 
     block = Grid(x - h, x + h, (3,) * n)
     slopes, links = tuple(p), tuple(Links(width, width) for width in h)
     on = Discretisation(problem, block, Limited(), x.dtype, t)
-    hamiltonian = DiscreteHamiltonian(on, list(x), value, slopes, slopes, bends, links)
+    changes = _changes(problem, grid, look, t, x)
+    hamiltonian = DiscreteHamiltonian(on, list(x), value, slopes, slopes, bends, links, *changes)
     _, u, d = optimise(hamiltonian)
     known = jnp.all(jnp.isfinite(p))  # otherwise minimising over NaN slopes would still return an admissible action
     control, disturbance = (jnp.where(known, _middle(action, x.dtype, n), jnp.nan) for action in (u, d))
     if greedy.bounds is not None:
         control = jnp.asarray(control_of(bounds_at(greedy.bounds, *problem.state_arguments(x, t)), control))
     return control, disturbance
+
+
+def _changes(problem: Problem, grid: Grid, look: Callable, t: Number, x: jax.Array) -> tuple[tuple, tuple]:
+    """V after every change of the mode at random, and after every jump of the state, minus V."""
+    if problem.mode_rates is None and problem.landings is None:
+        return (), ()
+    count, here = len(grid.modes), look(x)
+    numbers = range(1, count) if problem.mode_rates is not None else ()
+    gaps = tuple(look(x.at[0].set((x[0] + number) % count)) - here for number in numbers)
+    if problem.landings is None:
+        return gaps, ()
+    u, d = (jnp.zeros(0 if each is None else each.dim, x.dtype) for each in (problem.controls, problem.disturbances))
+    after = jnp.asarray(problem.landings(*problem.arguments(x, u, d, t)), x.dtype)
+    if count:  # a jump keeps the mode
+        after = jnp.concatenate([jnp.full((len(after), 1), x[0]), after], axis=1)
+    return gaps, tuple(beyond_ends(look, after, grid, continuing_sides(grid)) - here)
 
 
 def _reflected(points: jax.Array, grid: Grid) -> jax.Array:

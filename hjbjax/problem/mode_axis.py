@@ -234,18 +234,14 @@ def refuse_modes(problem: Problem) -> None:
     Raises:
       ValueError: the problem has modes, jumps or pushes.
     """
-    if problem.jumps:
-        raise ValueError(
-            f"Problem.jumps: got a problem with {len(problem.jumps)} jumps, which this function does not take; wanted "
-            "a problem without jumps"
-        )
-    if problem.pushes:
-        raise ValueError(
-            f"Problem.pushes: got a problem with {len(problem.pushes)} pushes, which this function does not take; "
-            "wanted a problem\nwithout pushes: they move the state at once, not in time. Leave out pushes"
-        )
-    if problem.modes is not None:
-        raise ValueError(
-            f"Problem.modes: got a problem with the modes {problem.modes.names!r}, which this function does not take; "
-            "wanted a problem without modes"
-        )
+    found = (
+        (problem.jumps, f"Problem.jumps: got a problem with {len(problem.jumps)} jumps"),
+        (problem.pushes, f"Problem.pushes: got a problem with {len(problem.pushes)} pushes"),
+        (problem.modes, f"Problem.modes: got a problem with the modes {problem.modes and problem.modes.names!r}"),
+    )
+    for present, got in found:
+        if present:
+            raise ValueError(
+                f"{got}, which this function does not take: its equations have no term for sudden changes.\n"
+                "Leave them out, or use solve, march, simulate, greedy_feedback or hjb.chain"
+            )

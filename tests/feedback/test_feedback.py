@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import hjbjax as hjb
 from hjbjax import zoo
 from hjbjax.feedback.feedback import greedy_feedback
 from hjbjax.feedback.simulation import simulate
@@ -160,3 +161,64 @@ def test_at_a_wall_it_sees_the_mirror_image():
     x = np.array([0.0, 0.004, 0.3, 0.7, 0.996, 1.0])
     found = [float(greedy_feedback(problem, solution)(jnp.array([place]))[0]) for place in x]
     np.testing.assert_allclose(found, 18 / (18 - np.pi**2 * np.cos(np.pi * x)), rtol=0.02)
+
+
+# --- sudden changes ---
+
+
+def machine(rate=lambda x, u: jnp.array([[0.0, 0.3], [0.0, 0.0]]) + u[0] * jnp.array([[0.0, 0.0], [1.0, 0.0]]), **more):
+    """Effort repairs a broken machine, and may damage what it makes."""
+    return hjb.Problem(
+        lambda x, u, mode: (0.5, -0.5)[mode] * (1 - x) + 0.2 * u, controls=hjb.Box([0.0], [2.0]), discount=0.2,
+        reward=lambda x, u, mode: (1.0, 0.0)[mode] * x[0] - 0.4 * u[0] ** 2,
+        modes=hjb.Modes(("works", "broken"), rates=rate), **more,
+    )  # fmt: skip
+
+
+DAMAGE = [hjb.Jump(lambda x, u, mode: 0.3 * u[0], lambda x, u, mode: x / 2, cost=lambda x, u, mode: 0.1 * u[0])]
+
+
+@pytest.fixture(scope="module")
+def machines():
+    problem = machine(jumps=DAMAGE, growth=lambda x, u, mode: -0.05 * u[0])
+    return problem, hjb.solve(problem, hjb.Grid([0.0], [2.0], (41,)), tol=1e-6)
+
+
+def test_a_greedy_feedback_weighs_sudden_changes(machines):
+    """The control maximises the Hamiltonian with the gains from a repair, a jump and the growth, over dense samples."""
+    problem, solution = machines
+    feedback = hjb.greedy_feedback(problem, solution)
+    efforts = np.linspace(0, 2, 20_001)
+    for mode, name in enumerate(problem.modes.names):
+        for x in (0.33, 1.02, 1.71):
+            v, other, after = (solution.value_at([y], mode=m) for y, m in ((x, mode), (x, 1 - mode), (x / 2, mode)))
+            p = solution.costate_at([x], mode=mode)[0]
+            gains = (1.0, 0.0)[mode] * x - 0.4 * efforts**2 + p * ((0.5, -0.5)[mode] * (1 - x) + 0.2 * efforts)
+            gains += (
+                (0.3, efforts)[mode] * (other - v) + 0.3 * efforts * (after - v - 0.1 * efforts) - 0.05 * efforts * v
+            )
+            found = feedback([x], mode=name)
+            assert found[0] == pytest.approx(efforts[np.argmax(gains)], abs=2e-4)
+            np.testing.assert_array_equal(found, feedback(np.array([mode, x])))
+    assert abs(feedback([1.0], mode="broken")[0] - solution.control_at([1.0], mode="broken")[0]) < 0.05
+
+
+@pytest.mark.slow
+def test_simulate_takes_a_greedy_feedback_with_modes(machines):
+    problem, solution = machines
+    path = hjb.simulate(problem, hjb.greedy_feedback(problem, solution), [1.0], 10.0, mode="broken", key=2, steps=50)
+    assert set(path.modes) == {0, 1}
+    where = np.flatnonzero(path.modes == 1)[1:-1]
+    wanted = hjb.greedy_feedback(problem, solution).control_at(path.states[where], mode="broken")
+    np.testing.assert_allclose(path.controls[where], wanted, atol=1e-6)
+
+
+def test_what_a_greedy_feedback_with_modes_refuses(machines):
+    problem, solution = machines
+    with pytest.raises(ValueError, match="got jumps whose landing depends on an action") as caught:
+        hjb.greedy_feedback(machine(jumps=[hjb.Jump(1.0, lambda x, u, mode: x - u)]), solution)
+    assert "pass the solution itself" in str(caught.value)
+    with pytest.raises(ValueError, match=r"modes \('works', 'broken'\) and a solution with \(\)"):
+        hjb.greedy_feedback(problem, solution.in_mode("works"))
+    with pytest.raises(ValueError, match="without a mode"):
+        hjb.greedy_feedback(problem, solution)([1.0])

@@ -65,6 +65,11 @@ CHASE = hjb.Problem(  # a game with a target, and noise along one axis
 )  # fmt: skip
 SHAKEN = hjb.Problem(swing, effort, U, noise=0.6, discount=0.5)
 SKEW = hjb.Problem(swing, effort, U, noise=np.array([[0.5, 0.0], [0.2, 0.4]]), discount=0.5)
+MODES = hjb.Problem(
+    lambda x, u, mode: swing(x, (1.0, 0.2, 0.0)[mode] * u), lambda x, u, mode: effort(x, u) + 0.1 * mode, U, noise=0.6,
+    discount=0.5, modes=hjb.Modes(("whole", "weak", "lost"), rates=[[0, 0.3, 0.1], [0.5, 0, 0.2], [0.4, 0, 0]]),
+)  # fmt: skip
+STILL = {"drift": lambda x, u: 0 * x, "discount": 0.5}
 STEPS = {"method": hjb.ValueIteration(), "scheme": hjb.Upwind(), "max_steps": 40, "throw": False}
 
 
@@ -364,6 +369,11 @@ def krylov():
 
 
 @case
+def krylov_with_modes():
+    return within_certificates(MODES, ANGLE, None, (4, 2))
+
+
+@case
 def krylov_with_correlated_noise():
     return within_certificates(SKEW, FLAT, None, (4, 2))
 
@@ -473,6 +483,8 @@ def refusals():
         "traced": lambda: jax.jit(lambda b: hjb.solve(discounted(b), FLAT, mesh=two).value)(0.5),
         "traced march": lambda: jax.jit(lambda b: hjb.march(discounted(b), FLAT, 1.0, step=0.01, mesh=two).value)(0.5),
         "host": lambda: hjb.solve(calling, FLAT, mesh=two),
+        "jumps": lambda: hjb.solve(hjb.Problem(**STILL, jumps=[hjb.Jump(1.0, lambda x, u: -x)]), FLAT, mesh=two),
+        "pushes": lambda: hjb.solve(hjb.Problem(**STILL, pushes=[hjb.Push([1.0, 0.0], 1.0)]), FLAT, mesh=two),
         "no mesh of lanes": lambda: hjb.solve_batch([PLAIN], FLAT, mesh=8),
         "lanes to a file": lambda: hjb.solve_batch([PLAIN], FLAT, mesh=two, checkpoint="run.npz"),
         "lanes by the host": lambda: hjb.solve_batch([PLAIN, calling], FLAT, mesh=two),

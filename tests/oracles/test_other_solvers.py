@@ -154,13 +154,15 @@ def one_mass(x, u):
     return jnp.stack([x[1], u[0]])
 
 
+@pytest.mark.slow
 def test_quantecon_agrees_on_an_economy_with_modes_and_jumps():
     """Saving with two incomes, and wealth that may lose half of its value."""
     from quantecon.markov import DiscreteDP
 
     saving = hjb.Problem(
         lambda a, c, mode: (0.1, 0.2)[mode] + 0.03 * a - c, reward=lambda a, c, mode: -1 / c[0], discount=0.05,
-        controls=hjb.Finite(np.linspace(0.02, 0.4, 30)[:, None]), modes=hjb.Modes(("poor", "rich"), rates=[[0, 1.2], [1.2, 0]]),
+        controls=hjb.Finite(np.linspace(0.02, 0.4, 30)[:, None]),
+        modes=hjb.Modes(("poor", "rich"), rates=[[0, 1.2], [1.2, 0]]),
         jumps=[hjb.Jump(0.2, lambda a, c, mode: a / 2, cost=lambda a, c, mode: 0.1 * c[0])],
     )  # fmt: skip
     grid = hjb.Grid([-0.1], [2.0], (64,), edges="constrained")

@@ -277,8 +277,8 @@ def manipulator(
       g: gravity.
       torque: the bound on each |τ_i|.
       discount: β.
-      shape: number of nodes in the n angles (even) and the n velocities (odd), on [−π, π)ⁿ × [−8, 8]ⁿ; ``None`` is
-        60 and 61 with one link, 20 and 21 with more links.
+      shape: number of nodes in the n angles (even) and the n velocities (odd), on [−π, π)ⁿ × [−8, 8]ⁿ, with one link
+        on [−π, π) × [−10, 10]; ``None`` is 60 and 61 with one link, 20 and 21 with more links.
     """
     system = Manipulator(links=links, lengths=lengths, masses=masses, g=g)
     if shape is None:  # even numbers of angles and odd numbers of velocities put a node at rest upright
@@ -295,10 +295,11 @@ def manipulator(
         control_units=("N m",) * links,
     )
     names = ("angle", "velocity")
+    fastest = 10.0 if links == 1 else 8.0  # with 8 the ends decide V at one node in twenty of one link
     grid = Grid(
         # n angles, then n velocities, as in the state; a free fall of one link reaches the speed 2√g = 6.3
-        [-math.pi] * links + [-8.0] * links,
-        [math.pi] * links + [8.0] * links,
+        [-math.pi] * links + [-fastest] * links,
+        [math.pi] * links + [fastest] * links,
         shape,
         periodic=(True,) * links + (False,) * links,
         names=names if links == 1 else tuple(f"{name} {i + 1}" for name in names for i in range(links)),

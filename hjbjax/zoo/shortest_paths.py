@@ -153,7 +153,7 @@ def dubins(
     turn: Number = 1.0,
     radius: Number = 0.3,
     discount: Number = 1.0,
-    shape: tuple[int, ...] = (41, 41, 40),
+    shape: tuple[int, ...] = (41, 40, 40),
 ) -> tuple[Problem, Grid]:
     """Drive a Dubins car to a disc around the origin in the least time, with any heading, on [−2, 2]² × [−π, π).
 
@@ -164,7 +164,7 @@ def dubins(
       turn: the bound on |θ̇|; the tightest circle has radius s/turn.
       radius: the radius of the disc.
       discount: β.
-      shape: number of nodes per axis.
+      shape: number of nodes per axis; an even number in y puts the switch at y = 0 between two nodes.
     """
     problem = Problem(
         Dubins(speed).drift,

@@ -219,8 +219,10 @@ def decide(
         answer = jax.tree.map(lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf), answer)
     numbers = [leaf for leaf in jax.tree.leaves((found, answer)) if not is_traced(leaf)]
     if not all(np.all(np.isfinite(leaf)) for leaf in numbers):
+        place, cure = ("at or near", ": choose another x, or a smaller radius=") if "samples" in static else ("at", "")
         raise ValueError(
-            f"a derivative of the fields is not finite at or near x = {state.tolist()}; the fields must be smooth there"
+            f"a derivative of the fields is not finite {place} x = {state.tolist()}; the fields must be smooth "
+            f"there{cure}"
         )
     return answer
 

@@ -247,3 +247,11 @@ def test_brocketts_condition_in_other_words_and_units():
     unmoved = [lambda x: jnp.array([1.0, 1.0, 0.0])]
     with pytest.raises(ValueError, match="no input keeps"):
         stability.brockett_check(lambda x: jnp.array([1.0, 1.0 + 1e-6, 0.0]), unmoved, np.zeros(3))
+
+
+def test_a_neighbourhood_in_which_a_field_is_not_smooth_names_its_radius():
+    root = lambda x: jnp.stack([x[1], jnp.sqrt(x[0])])  # noqa: E731
+    push = lambda x: jnp.array([0.0, 1.0])  # noqa: E731
+    with pytest.raises(ValueError, match="not finite at or near .* a smaller radius="):
+        geometry.relative_degree(root, push, lambda x: x[0], [0.05, 0.0])
+    assert geometry.relative_degree(root, push, lambda x: x[0], [0.05, 0.0], radius=0.01).degree == 2

@@ -210,16 +210,16 @@ def stopped(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray, 
     if len(section.axes) == 1:
         (x,) = section.coordinates
         ends = [*x[:1][inside[:1]], *points_of(x, values, inside, None), *x[-1:][inside[-1:]]]
-        for left, right in zip(ends[::2], ends[1::2], strict=True):
-            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, **style))
+        for k, (left, right) in enumerate(zip(ends[::2], ends[1::2], strict=True)):
+            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k or named else name, **style))
     else:
         area: Any = {"levels": [0.0, 1.0], "colors": "none", "hatches": [DOTS], "zorder": 2}
         dots = ax.contourf(*section.coordinates, inside.T - 0.5, **area)
         dots.set(edgecolor=STROKE, linewidth=0.0)
         segments = segments_of(section.coordinates, values, inside, (None, None))
         artists += [dots, ax.add_collection(LineCollection(list(segments), colors="black", linewidths=1.0, zorder=2.5))]
-    if not named:  # of no size, for the legend only
-        ax.add_patch(Rectangle((0, 0), 0, 0, transform=ax.transAxes, linewidth=0.6, label=name, **style))
+        corner = (float(section.coordinates[0][0]), float(section.coordinates[1][0]))
+        ax.add_patch(Rectangle(corner, 0, 0, linewidth=0.6, label=name, **style))
     legend(ax)
     return artists
 

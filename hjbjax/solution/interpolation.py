@@ -88,7 +88,7 @@ def query(
         return look(*as_jax((grid, values)), _states(grid, x, dtype, name), clamp, when).astype(dtype)
 
 
-def compiled(look: Interpolation, grid: Grid, values: Array) -> Callable[[np.ndarray], jax.Array]:
+def compile_query(look: Interpolation, grid: Grid, values: Array) -> Callable[[np.ndarray], jax.Array]:
     """``query`` with ``clamp`` for concrete float64 states as one program; requires ``settings.are_usual()``.
 
     A call takes about 25 microseconds, most of which JAX takes to start the program. The result is a tracer inside a

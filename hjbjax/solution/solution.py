@@ -32,7 +32,7 @@ from hjbjax.solution.interpolation import (
     between,
     between_defined,
     check_query,
-    compiled,
+    compile_query,
     nearest,
     query,
     slopes_between,
@@ -383,7 +383,7 @@ class Solution:
         """``control_at`` as one program; None for a batch, a march and a traced solution."""
         if self.times is not None or self.policy is None or np.ndim(self.code) or is_traced(self):
             return None
-        return compiled(nearest if self.discrete else between_defined, self.grid, self.policy)
+        return compile_query(nearest if self.discrete else between_defined, self.grid, self.policy)
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: vars(self)[field.name] for field in dataclasses.fields(self)}  # programs are not pickled

@@ -258,3 +258,9 @@ def _backwards(drift: Callable, *arguments: Array) -> jax.Array:
 def _negative(distance: Callable, *arguments: Array) -> Array:
     """A signed distance with the opposite sign: ≥ 0 inside."""
     return -distance(*arguments)
+
+
+def depth(function: Any) -> Any:
+    """The signed distance l of a function −l that ``avoid`` or ``reach_avoid`` made; None for another function."""
+    made_here = isinstance(function, jax.tree_util.Partial) and function.func is _negative
+    return function.args[0] if made_here else None

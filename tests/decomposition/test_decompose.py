@@ -1,0 +1,177 @@
+"""Problems that fall apart: the blocks that are found, values against joint grids, bounds and refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hjbjax as hjb
+
+INTEGRATORS = {
+    "drift": lambda x, u: jnp.stack([x[1], u[0], x[3], u[1]]),
+    "controls": hjb.Box([-1.0] * 2, [1.0] * 2),
+}
+
+
+def squares(x, u):
+    return x @ x + u @ u
+
+
+@pytest.mark.slow
+def test_decoupled_double_integrators_have_the_riccati_value():
+    """P = [[√3, 1], [1, √3]] for each; limited slopes are exact on a quadratic."""
+    problem = hjb.Problem(cost=squares, **{**INTEGRATORS, "controls": hjb.Box([-9.0] * 2, [9.0] * 2)})
+    parts = hjb.decompose(problem, 4)
+    assert (parts.states, parts.controls, parts.rule, parts.bound) == (((0, 1), (2, 3)), ((0,), (1,)), "sum", None)
+    solution = parts.solve(hjb.Grid([-1.0] * 4, [1.0] * 4, (41,) * 4))
+    p = np.array([[np.sqrt(3), 1], [1, np.sqrt(3)]])
+    x = np.array([[0.3, -0.1, 0.2, 0.2], [-0.2, 0.1, 0.0, 0.3]])
+    exact = np.einsum("ki,ij,kj->k", x[:, :2], p, x[:, :2]) + np.einsum("ki,ij,kj->k", x[:, 2:], p, x[:, 2:])
+    assert np.allclose(solution.value_at(x), exact, atol=0.02)
+    assert solution.status is hjb.Status.CONVERGED
+    gain = np.array([[1, np.sqrt(3), 0, 0], [0, 0, 1, np.sqrt(3)]])
+    assert np.allclose(solution.control_at(x), -x @ gain.T, atol=0.05)
+    assert np.allclose(jax.jit(solution.value_at)(jnp.asarray(x)), solution.value_at(x), atol=1e-5)
+    slope = np.concatenate([2 * x[:, :2] @ p, 2 * x[:, 2:] @ p], axis=1)
+    assert np.allclose(solution.costate_at(x), slope, atol=0.1)
+    path = hjb.simulate(problem, lambda x: solution.control_at(x, clamp=True), x[0], 8.0, steps=40)
+    assert abs(path.cost - exact[0]) < 0.02
+
+
+def test_a_saved_solution_of_blocks_comes_back(tmp_path):
+    problem = hjb.Problem(
+        lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-3.0] * 2, [3.0] * 2), discount=1.0,
+        control_names=("left", "right"),
+    )  # fmt: skip
+    solution = hjb.decompose(problem, 2).solve(hjb.Grid([-1.0] * 2, [1.0] * 2, (41, 41)))
+    x = np.array([0.3, -0.6])
+    exact = 0.6180339887 * x @ x
+    assert abs(solution.value_at(x) - exact) < 2e-3
+    assert solution.grid_error_at(x) < 5e-3
+    solution.save(tmp_path / "blocks")
+    back = hjb.BlockSolution.load(tmp_path / "blocks")
+    assert back.value_at(x) == solution.value_at(x)
+    assert (back.rule, back.states, back.controls) == ("sum", ((0,), (1,)), ((0,), (1,)))
+    joint = solution.on_grid(hjb.Grid([-1.0] * 2, [1.0] * 2, (5, 5)))
+    assert joint.labels.controls == ("left", "right")
+    assert np.allclose(joint.value_at([0.5, 0.0]), solution.value_at([0.5, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("cost", "parts"),
+    [
+        (lambda x: jnp.maximum(jnp.linalg.norm(x[:2]), jnp.abs(x[2]) + x[3] ** 2) - 0.5, "max"),
+        (lambda x: -jnp.min(-jnp.stack([x[0] * x[1], 2.0 * x[2]])), "max"),
+        (lambda x: -0.5 * jnp.maximum(x[0], x[2]), "min"),
+        (lambda x: jnp.cos(x[0]) + 3 * x[1] ** 2 - jnp.sum(x[2:] ** 2), "sum"),
+    ],
+)
+def test_the_rule_and_the_parts_are_read_from_the_trace(cost, parts):
+    problem = hjb.Problem(terminal_cost=cost, **INTEGRATORS)
+    found = hjb.decompose(problem, 4)
+    assert found.rule == parts
+    assert found.states == ((0, 1), (2, 3))
+    x = np.random.default_rng(0).normal(size=4)
+    values = [float(own.terminal_cost(x[list(at)])) for own, at in zip(found.problems, found.states, strict=True)]
+    combined = {"max": max, "min": min, "sum": sum}[parts](values)
+    assert abs(combined - float(cost(x))) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"drift": lambda x, u: jnp.stack([x[1], u[0] - x[2], x[3], u[1] + x[0]])}, r"x\[1\] reads x\[2\]"),
+        ({"cost": lambda x, u: (x[0] - x[2]) ** 2 + x[1] ** 2 + x[3] ** 2 + u @ u}, r"term that reads x\[0\], x\[2\]"),
+        ({"controls": hjb.Ball(1.0, 2)}, "not a Box couples"),
+        ({"drift": lambda x, u: jnp.stack([x[1], u[0], x[3], u[0] + u[1]])}, r"u\[0\] drives x\[1\], x\[3\]"),
+        ({"target": lambda x: jnp.abs(x[0]) - 0.1, "discount": 1.0}, "couples the blocks"),
+        ({"terminal_cost": lambda x: jnp.maximum(x[0], x[2])}, "does not separate"),
+    ],
+)
+def test_a_coupling_is_refused_and_named(change, said):
+    with pytest.raises(ValueError, match=said):
+        hjb.decompose(hjb.Problem(**{**INTEGRATORS, "cost": squares, **change}), 4)
+
+
+def test_subsystems_that_share_a_heading_give_a_bound_on_request():
+    """Chen et al.: a car at unit speed as (x, heading) and (y, heading); the union of two targets is exact."""
+    drift = lambda x, u: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), u[0]])  # noqa: E731
+    both = hjb.reach(drift, hjb.Box([-1.0], [1.0]), lambda x: jnp.maximum(jnp.abs(x[0]), jnp.abs(x[1])) - 0.5)
+    either = hjb.reach(drift, hjb.Box([-1.0], [1.0]), lambda x: jnp.minimum(jnp.abs(x[0]), jnp.abs(x[1])) - 0.5)
+    with pytest.raises(ValueError, match="bound=True"):
+        hjb.decompose(both, 3)
+    found = hjb.decompose(both, 3, bound=True)
+    assert (found.rule, found.bound, found.states) == ("first", "lower", ((0, 2), (1, 2)))
+    assert hjb.decompose(either, 3, bound=True).bound is None
+
+
+LINES = {"drift": lambda x, u: u, "controls": hjb.Box([-1.0, -0.5], [1.0, 0.5])}
+
+
+@pytest.mark.slow
+def test_a_tube_into_an_intersection_needs_one_moment():
+    """x' = u, |u₁| ≤ 1, |u₂| ≤ ½: V = max_i max(|x_i| − speed_i t, 0) − ½ at the end t, the best moment."""
+    problem = hjb.reach(target=lambda x: jnp.maximum(jnp.abs(x[0]), jnp.abs(x[1])) - 0.5, **LINES)
+    parts = hjb.decompose(problem, 2)
+    assert (parts.rule, parts.bound) == ("first", None)
+    solution = parts.march(
+        hjb.Grid([-3.0] * 2, [3.0] * 2, (121, 121), edges="linear"), 1.0, times=[0.0, 0.25, 0.5, 1.0]
+    )
+    x = np.array([[1.2, 0.3], [0.9, 1.2], [-2.0, 0.0], [0.2, -0.1]])
+    exact = np.max(np.maximum(np.abs(x) - [1.0, 0.5], 0), axis=1) - 0.5
+    assert np.allclose(solution.value_at(0.0, x), exact, atol=0.02)
+    assert np.all(np.sign(solution.control_at(0.0, x[:1])) == [[-1, -1]])
+    assert np.isfinite(solution.grid_error_at(0.0, x)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
+def test_two_double_integrators_equal_the_joint_march():
+    """2 + 2 against four dimensions: the same scheme on the same spacing."""
+    distance = lambda x: jnp.maximum(jnp.abs(x[0]), jnp.abs(x[2])) - 0.5  # noqa: E731
+    problem = hjb.reach(target=distance, tube=False, **INTEGRATORS)
+    grid = hjb.Grid([-2.0, -1.5] * 2, [2.0, 1.5] * 2, (21, 17) * 2, edges="linear")
+    parts = hjb.decompose(problem, 4).march(grid, 1.0)
+    joint = hjb.march(problem, grid, 1.0, policy=False)
+    x = np.random.default_rng(1).uniform(-0.9, 0.9, (200, 4))
+    off = np.abs(parts.value_at(0.0, x) - joint.value_at(0.0, x))
+    assert off.max() <= joint.grid_error.max() + parts.grid_error_at(0.0, x).max()
+    assert off.mean() < 0.02
+
+
+def three_states(x, u):
+    """A cart with a lagging actuator."""
+    return [x[1], x[2], u - x[2]]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
+def test_a_reach_avoid_of_three_and_three_states_equals_the_joint_march():
+    problem = hjb.reach_avoid(
+        lambda x, u: jnp.stack([*three_states(x[:3], u[0]), *three_states(x[3:], u[1])]),
+        hjb.Box([-1.0] * 2, [1.0] * 2),
+        lambda x: jnp.maximum(jnp.abs(x[0]), jnp.abs(x[3])) - 0.6,
+        lambda x: jnp.minimum(x[0] + 1.4, x[3] + 1.4),
+    )
+    grid = hjb.Grid([-2.0, -1.2, -1.0] * 2, [2.0, 1.2, 1.0] * 2, (13, 9, 7) * 2, edges="linear")
+    parts = hjb.decompose(problem, 6)
+    assert (parts.rule, parts.states) == ("first", ((0, 1, 2), (3, 4, 5)))
+    solution = parts.march(grid, 0.8)
+    joint = hjb.march(problem, grid, 0.8, policy=False, dtype="float32")
+    x = np.random.default_rng(2).uniform([-1, -0.6, -0.5] * 2, [1, 0.6, 0.5] * 2, (300, 6))
+    off = np.abs(solution.value_at(0.0, x) - joint.value_at(0.0, x))
+    assert off.max() < 1 / 6  # half of the spacing along the positions; there is no estimate with obstacles
+
+
+@pytest.mark.slow
+def test_three_blocks_of_two_states():
+    """2 + 2 + 2, each the Riccati value of a double integrator."""
+    problem = hjb.Problem(
+        lambda x, u: jnp.stack([x[1], u[0], x[3], u[1], x[5], u[2]]), squares, hjb.Box([-9.0] * 3, [9.0] * 3)
+    )
+    parts = hjb.decompose(problem, 6)
+    assert parts.states == ((0, 1), (2, 3), (4, 5))
+    x = np.array([0.3, -0.1, 0.2, 0.2, -0.3, 0.1])
+    p = np.array([[np.sqrt(3), 1], [1, np.sqrt(3)]])
+    exact = sum(x[i : i + 2] @ p @ x[i : i + 2] for i in (0, 2, 4))
+    assert abs(parts.solve(hjb.Grid([-1.0] * 6, [1.0] * 6, (41,) * 6)).value_at(x) - exact) < 0.03

@@ -1,0 +1,369 @@
+"""``fit``: parameters that make a loss least, by an optimiser of optax, and the result ``Fit``.
+
+The optimiser works on z = θ/scale, where the scale of a parameter is the size of its initial value, the width of its
+bounds if that is zero, or 1. Its step lengths are therefore relative, and other units do not change its path. After
+every step the parameters are moved to the nearest point within their bounds.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from hjbjax.problem import arguments
+from hjbjax.problem.pytree import INTERRUPT, front_door, is_traced
+from hjbjax.problem.settings import own_settings
+from hjbjax.solution import files
+from hjbjax.solution.clock import Clock, noting_interrupts
+from hjbjax.solution.placement import Path
+from hjbjax.solution.solution import SolveError
+from hjbjax.solution.status import Status, warn
+from hjbjax.solvers.host_loop import progress_bar
+
+RATE = 0.05  # of the default optimiser, relative to the size of each parameter
+EARLY = 1e-3  # fraction of the tolerance at which a run ends before its last step
+PATIENCE = 10  # the least number of steps without improvement after which a fit has converged
+DIFFERENCE = 1e-4  # relative step of the finite difference that checks the gradient
+FAULTY = 0.01  # relative error of a directional derivative above which the gradient is wrong
+FORMAT, VERSION = "hjbjax.Fit", 1
+
+MESSAGES = {
+    Status.CONVERGED: "The loss stopped decreasing.",
+    Status.MAX_STEPS: "Reached the number of steps; the loss was still decreasing. Continue from fit.parameters.",
+    Status.NONFINITE: "The loss or its gradient became NaN or infinite; the best parameters are kept. Add bounds.",
+    Status.INTERRUPTED: "The fit was interrupted; the best parameters are kept. Continue from fit.parameters.",
+    Status.TIME_LIMIT: "Reached time_limit; the best parameters are kept. Continue from fit.parameters.",
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """The result of ``fit``.
+
+    Args:
+      parameters: the best parameters, of the structure of the initial ones, in NumPy.
+      loss: the loss at these parameters.
+      history: the loss before every step of the best run, shape (k,).
+      status: CONVERGED, MAX_STEPS, NONFINITE, INTERRUPTED or TIME_LIMIT.
+      starts: the smallest loss of every run; one number without restarts.
+      gradient_error: the relative error of the gradient along a random direction, compared with a finite difference;
+        ``None`` if it was not checked.
+      seconds: the duration.
+    """
+
+    parameters: Any
+    loss: float
+    history: np.ndarray
+    status: Status
+    starts: tuple[float, ...] = ()
+    gradient_error: float | None = None
+    seconds: float = 0.0
+
+    @property
+    def message(self) -> str:
+        """The outcome and the remedy in one or two sentences."""
+        return MESSAGES.get(self.status, self.status.message)
+
+    def save(self, path: Path, *, force: bool = False) -> None:
+        """Write the result to ``path`` atomically; ``Fit.load`` reads it.
+
+        Args:
+          path: the file.
+          force: replace an existing file.
+
+        Raises:
+          FileExistsError: the file exists, without ``force``.
+          FileError: the file cannot be written.
+        """
+        leaves, _ = jax.tree_util.tree_flatten_with_path(self.parameters)
+        names = [jax.tree_util.keystr(where) for where, _ in leaves]
+        arrays = {f"parameter{i}": np.asarray(leaf, float) for i, (_, leaf) in enumerate(leaves)}
+        header = {
+            "format": FORMAT, "version": VERSION, "names": names, "loss": self.loss, "status": int(self.status),
+            "starts": self.starts, "gradient_error": self.gradient_error, "seconds": self.seconds,
+        }  # fmt: skip
+        files.write(path, header, {**arrays, "history": self.history}, force=force)
+
+    @classmethod
+    def load(cls, path: Path) -> "Fit":
+        """The result in a file written by ``save``.
+
+        Its parameters are a dictionary from the place of each array, such as "['mass']", to the array, because a file
+        holds no classes.
+
+        Args:
+          path: the file.
+
+        Raises:
+          FileError: the file is missing, damaged or foreign.
+        """
+        return files.read(path, FORMAT, VERSION, _plan, _from_file)
+
+    def __str__(self) -> str:
+        lines = [f"{self.status.name}: loss {self.loss:.6g} after {len(self.history)} steps, {self.seconds:.3g} s"]
+        leaves, _ = jax.tree_util.tree_flatten_with_path(self.parameters)
+        for where, leaf in leaves:
+            lines.append(f"  {jax.tree_util.keystr(where) or 'parameter':<20} {np.array2string(leaf, precision=6)}")
+        if self.gradient_error is not None:
+            lines.append(f"  gradient checked: relative error {self.gradient_error:.1e}")
+        return "\n".join(lines)
+
+
+@front_door
+def fit(
+    loss: Callable,
+    parameters: Any,
+    *,
+    optimiser: Any = None,
+    steps: int = 200,
+    bounds: tuple[Any, Any] | None = None,
+    restarts: int = 0,
+    seed: int = 0,
+    check_gradient: bool = False,
+    tol: float = 1e-6,
+    time_limit: float | None = None,
+    progress: bool | None = None,
+) -> Fit:
+    """Find the parameters that make a loss least, in float64; the loss may contain solve, march and simulate.
+
+    Args:
+      loss: a function of the parameters that returns a number and that JAX can trace and differentiate.
+      parameters: the initial parameters: a number, an array, or a dictionary, a dataclass or another pytree of them.
+
+    Keyword Args:
+      optimiser: a gradient transformation of optax, such as ``optax.adam(0.02)`` or ``optax.lbfgs()``, for parameters
+        in units of their initial size. Default: Adam with a rate that falls from 0.05 to zero over the steps.
+      steps: the largest number of steps of a run.
+      bounds: a pair (lower, upper), each of the structure of the parameters, or one number for all; may be infinite.
+      restarts: number of further runs, from random parameters: within the bounds if these are finite, otherwise around
+        the initial ones. The best run counts.
+      seed: of the random numbers of restarts and of the check.
+      check_gradient: compare the gradient at the initial parameters with a finite difference, and warn if they differ.
+      tol: a run has converged if the loss changed by less than this fraction of its whole decrease over the last tenth
+        of the steps, and at least ten. It ends early below a thousandth of this fraction.
+      time_limit: seconds, including compilation.
+      progress: show a bar of the steps after a second; ``None``: on a terminal.
+
+    Returns:
+      A Fit with the best parameters of all steps. Ctrl-C ends the fit and keeps them.
+
+    Raises:
+      ValueError: the loss is not finite at the initial parameters, or an argument is not admissible.
+      TypeError: the loss cannot be called, or a parameter is not a number.
+      SolveError: Ctrl-C or the time limit before the first step was complete.
+
+    Example:
+      >>> found = fit(lambda p: (p["a"] - 3.0) ** 2 + (p["b"] + 1.0) ** 2, {"a": 1.0, "b": -2.0})
+      >>> {name: round(float(value), 3) for name, value in found.parameters.items()}, found.status.name
+      ({'a': 3.0, 'b': -1.0}, 'CONVERGED')
+    """
+    if not callable(loss):
+        raise TypeError(f"fit: got loss = {loss!r:.100}, wanted a function of the parameters")
+    if is_traced(parameters):
+        raise ValueError("fit: got traced parameters, but it runs on the host: call it outside jit, vmap and grad")
+    count = arguments.count(steps, "fit: steps")
+    arguments.positive(tol, "fit: tol")
+    if isinstance(restarts, bool) or not isinstance(restarts, (int, np.integer)) or restarts < 0:
+        raise ValueError(f"fit: got restarts = {restarts!r}, wanted an integer ≥ 0")
+    clock = Clock(seconds=time_limit, progress=progress)
+    with noting_interrupts(clock), own_settings(x64=True):
+        task = _task(loss, parameters, optimiser, bounds, count)
+        draw = np.random.default_rng(seed)
+        error = _gradient_error(task, draw) if check_gradient else None
+        runs: list[_Run] = []
+        with progress_bar(progress, {"total": count * (1 + restarts), "desc": "fit"}) as bar:
+            for start in [task.start, *(_random_start(task, draw) for _ in range(restarts))]:
+                runs.append(_run(task, start, count, tol, clock, bar))
+                if runs[-1].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+                    break
+        best = min(runs, key=lambda run: run.loss)
+        if best.z is None:
+            if best.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+                raise SolveError(f"fit: {best.status}, before the first step was complete")
+            raise ValueError(
+                "fit: the loss or its gradient is not finite at the initial parameters. A solve that does not converge "
+                "is NaN here:\ncall the loss outside of fit to see the reason"
+            )
+        found = jax.tree.map(np.asarray, task.parameters(best.z))
+        # a run that was cut short leaves a better earlier run as it is, but the fit is not complete
+        status = next(
+            (run.status for run in runs if run.status in (Status.INTERRUPTED, Status.TIME_LIMIT)), best.status
+        )
+    return Fit(
+        found, best.loss, np.array(best.history), status, tuple(run.loss for run in runs), error, clock.elapsed()
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """A fit in scaled parameters: ``step`` returns loss, finite flag, new parameters and new state of the optimiser."""
+
+    start: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    begin: Callable
+    step: Callable
+    loss: Callable
+    value_and_grad: Callable
+    parameters: Callable
+
+
+@dataclasses.dataclass
+class _Run:
+    """One run: the best parameters, their loss, and the losses of all steps."""
+
+    status: Status
+    z: np.ndarray | None = None
+    loss: float = math.inf
+    history: list[float] = dataclasses.field(default_factory=list)
+
+
+def _task(loss: Callable, parameters: Any, optimiser: Any, bounds: tuple[Any, Any] | None, steps: int) -> _Task:
+    """The functions of a fit, after checks."""
+    import optax
+
+    try:
+        initial = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
+    except (TypeError, ValueError):
+        raise TypeError(f"fit: got parameters = {parameters!r:.200}, wanted a pytree of real numbers") from None
+    if not jax.tree.leaves(initial):
+        raise ValueError("fit: got no parameters")
+    raveled, unravel = ravel_pytree(initial)
+    flat = np.asarray(raveled)
+    lower, upper = _bounds(bounds, initial, flat)
+    width = np.where(np.isfinite(upper - lower), upper - lower, 1.0)
+    scale = np.where(flat != 0, np.abs(flat), np.where(width > 0, width, 1.0))
+    if optimiser is None:
+        optimiser = optax.adam(optax.cosine_decay_schedule(RATE, steps))
+    elif not (hasattr(optimiser, "init") and hasattr(optimiser, "update")):
+        raise TypeError(f"fit: got optimiser = {optimiser!r:.100}, wanted one of optax, such as optax.adam(0.02)")
+    optimiser = optax.with_extra_args_support(optimiser)
+    low, high = lower / scale, upper / scale
+
+    def of_scaled(z: Any) -> jax.Array:
+        value = jnp.asarray(loss(unravel(z * scale)))
+        if value.shape != ():
+            raise ValueError(f"fit: the loss returned shape {value.shape}, wanted one number")
+        return value.astype(jnp.float64)
+
+    @jax.jit
+    def step(z: Any, state: Any) -> tuple[Any, ...]:
+        value, slope = jax.value_and_grad(of_scaled)(z)
+        updates, state = optimiser.update(slope, state, z, value=value, grad=slope, value_fn=of_scaled)
+        finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(slope))
+        return value, finite, jnp.clip(optax.apply_updates(z, updates), low, high), state
+
+    return _Task(
+        flat / scale, low, high, optimiser.init, step, jax.jit(of_scaled), jax.jit(jax.value_and_grad(of_scaled)),
+        lambda z: unravel(jnp.asarray(z * scale)),
+    )  # fmt: skip
+
+
+def _bounds(bounds: Any, initial: Any, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of the flat parameters."""
+    if bounds is None:
+        return np.full(flat.shape, -np.inf), np.full(flat.shape, np.inf)
+    if not isinstance(bounds, Sequence) or len(bounds) != 2:
+        raise ValueError(f"fit: got bounds = {bounds!r:.200}, wanted a pair (lower, upper)")
+    ends = []
+    for end in bounds:
+        if np.ndim(end) == 0 and not isinstance(end, dict):
+            ends.append(np.full(flat.shape, float(end)))
+            continue
+        structures: list[Any] = [jax.tree.structure(end), jax.tree.structure(initial)]
+        if structures[0] != structures[1]:
+            raise ValueError("fit: the bounds and the parameters have different structures; wanted one per parameter")
+        each = jax.tree.map(lambda bound, leaf: np.broadcast_to(np.asarray(bound, float), leaf.shape), end, initial)
+        ends.append(np.asarray(ravel_pytree(each)[0]))
+    lower, upper = ends
+    if np.any(np.isnan(lower) | np.isnan(upper)) or np.any((flat < lower) | (flat > upper)):
+        raise ValueError(
+            f"fit: the initial parameters {flat.tolist()} are not within the bounds from {lower.tolist()} to "
+            f"{upper.tolist()}; move them inside"
+        )
+    return lower, upper
+
+
+def _random_start(task: _Task, draw: np.random.Generator) -> np.ndarray:
+    """Random scaled parameters."""
+    finite = np.isfinite(task.lower) & np.isfinite(task.upper)
+    low, high = np.where(finite, task.lower, 0.0), np.where(finite, task.upper, 1.0)
+    uniform = low + (high - low) * draw.uniform(size=task.start.shape)
+    around = task.start * np.exp(draw.normal(size=task.start.shape)) + 0.0
+    return np.clip(np.where(finite, uniform, around), task.lower, task.upper)
+
+
+def _run(task: _Task, start: np.ndarray, steps: int, tol: float, clock: Clock, bar: Any) -> _Run:
+    """One run of the optimiser from a start."""
+    z, state = jnp.asarray(start), task.begin(jnp.asarray(start))
+    run, patience = _Run(Status.MAX_STEPS), max(PATIENCE, steps // 10)
+    for _ in range(steps):
+        if (over := clock.over()) is not None:
+            run.status = over
+            break
+        try:
+            value, finite, following, state = task.step(z, state)
+            value, finite = float(value), bool(finite)
+        except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+            if not isinstance(error, KeyboardInterrupt) and not INTERRUPT.search(str(error)):
+                raise
+            run.status = Status.INTERRUPTED
+            break
+        if clock.interrupted:  # a solve in the loss was cut short, so this loss is not one
+            run.status = Status.INTERRUPTED
+            break
+        if not finite:
+            run.status = Status.NONFINITE
+            break
+        run.history.append(value)
+        if value < run.loss:
+            run.z, run.loss = np.asarray(z), value
+        if bar is not None:
+            bar.set_postfix_str(f"loss {run.loss:.3g}", refresh=False)
+            bar.update(1)
+        if len(run.history) > patience:
+            # the range of the last losses, because an optimiser with momentum may overshoot for some steps
+            moved, whole = float(np.ptp(run.history[-patience:])), run.history[0] - run.loss
+            run.status = Status.CONVERGED if moved <= tol * whole else Status.MAX_STEPS
+            if moved <= EARLY * tol * whole:
+                break
+        z = following
+    return run
+
+
+def _gradient_error(task: _Task, draw: np.random.Generator) -> float:
+    """The relative difference of the slope along a random direction from a central difference; warns if it is large."""
+    direction = draw.choice([-1.0, 1.0], task.start.shape)
+    z = jnp.asarray(task.start)
+    slope = float(task.value_and_grad(z)[1] @ direction)
+    above, below = (float(task.loss(z + sign * DIFFERENCE * direction)) for sign in (1, -1))
+    difference = (above - below) / (2 * DIFFERENCE)
+    error = abs(slope - difference) / max(abs(slope), abs(difference), np.finfo(float).tiny)
+    if not error <= FAULTY:
+        warn(
+            f"fit: the gradient along a random direction is {slope:.6g}, a finite difference gives {difference:.6g}. "
+            "Kinks, targets between nodes and coarse tolerances of a solve cause this; a smaller tol= may help"
+        )
+    return error
+
+
+def _plan(header: dict) -> dict[str, files.Expected]:
+    """The arrays of a file."""
+    shapes = tuple((None,) * axes for axes in range(5))
+    each = {f"parameter{i}": files.Expected(shapes, (np.float64,)) for i in range(len(header["names"]))}
+    return {**each, "history": files.Expected(((None,),), (np.float64,), optional=False)}
+
+
+def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> Fit:
+    """The result with the header and the arrays of a file."""
+    found = {name: arrays[f"parameter{i}"] for i, name in enumerate(header["names"])}
+    error = header["gradient_error"]
+    return Fit(
+        found, float(header["loss"]), arrays["history"], Status(header["status"]),
+        tuple(map(float, header["starts"])), None if error is None else float(error), float(header["seconds"]),
+    )  # fmt: skip

@@ -1,0 +1,123 @@
+"""Fits: optima that are known, bounds, checks and interrupts, and parameters recovered from closed loops."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import solve_continuous_are
+
+import hjbjax as hjb
+
+
+def bowl(p):
+    return (p["a"] - 3.0) ** 2 + jnp.sum((p["b"] - jnp.array([1.0, -2.0])) ** 2)
+
+
+START = {"a": 1.0, "b": np.array([0.5, -1.0])}
+
+
+def test_a_minimum_is_found_in_any_units():
+    found = hjb.fit(bowl, START, check_gradient=True)
+    assert found.status is hjb.Status.CONVERGED
+    assert np.allclose([found.parameters["a"], *found.parameters["b"]], [3, 1, -2], atol=5e-3)
+    assert found.gradient_error < 1e-6
+    assert found.loss == min(found.history)
+    scaled = hjb.fit(lambda p: 1e3 * bowl({"a": p["a"] / 1e6, "b": p["b"]}), {"a": 1e6, "b": START["b"]})
+    assert np.allclose(scaled.history[:20], 1e3 * found.history[:20], rtol=1e-5)
+
+
+def test_bounds_hold():
+    found = hjb.fit(bowl, START, bounds=({"a": 0.0, "b": -1.5}, {"a": 2.0, "b": 5.0}))
+    assert np.allclose([found.parameters["a"], *found.parameters["b"]], [2, 1, -1.5], atol=5e-3)
+    with pytest.raises(ValueError, match="not within the bounds"):
+        hjb.fit(bowl, START, bounds=(0.0, 2.0))
+
+
+@pytest.mark.slow
+def test_lbfgs_is_an_optimiser_too():
+    assert hjb.fit(bowl, START, optimiser=optax.lbfgs(), steps=30).loss < 1e-12
+
+
+def test_restarts_leave_a_local_minimum():
+    waves = lambda p: jnp.cos(3 * p) + 0.1 * (p - 3.2) ** 2  # noqa: E731
+    alone = hjb.fit(waves, 7.0, steps=60, bounds=(0.0, 10.0))
+    several = hjb.fit(waves, 7.0, steps=60, bounds=(0.0, 10.0), restarts=12, seed=1)
+    assert several.loss < alone.loss - 0.5
+    assert abs(several.parameters - np.pi) < 0.1
+    assert len(several.starts) == 13
+
+
+def test_a_loss_that_is_not_finite_is_refused_or_ends_the_run():
+    with pytest.raises(ValueError, match="not finite at the initial parameters"):
+        hjb.fit(lambda p: jnp.log(-p), 1.0)
+    ended = hjb.fit(lambda p: jnp.where(p > 0.5, p, jnp.nan), 1.0)
+    assert ended.status is hjb.Status.NONFINITE
+    assert 0.5 < ended.parameters <= 0.6
+
+
+def test_a_wrong_gradient_is_reported():
+    with pytest.warns(hjb.SolveWarning, match="finite difference"):
+        hjb.fit(lambda p: jax.lax.stop_gradient(p) * p, 1.0, steps=2, check_gradient=True)
+
+
+def test_a_time_limit_keeps_the_best_parameters_and_a_file_brings_them_back(tmp_path):
+    with pytest.raises(hjb.SolveError, match="TIME_LIMIT"):
+        hjb.fit(bowl, START, time_limit=0.0)
+    found = hjb.fit(bowl, START, steps=5)
+    assert found.status is hjb.Status.MAX_STEPS
+    found.save(tmp_path / "fit")
+    back = hjb.Fit.load(tmp_path / "fit")
+    assert (back.loss, back.status) == (found.loss, found.status)
+    assert np.array_equal(back.parameters["['b']"], found.parameters["b"])
+
+
+@pytest.mark.slow
+def test_a_design_with_a_known_optimum():
+    """x' = b u, cost x² + u²: V = x²/b, so V(1) + 4 b is least at b = ½, where it is 4."""
+    found = hjb.design(
+        lambda b: hjb.Problem(lambda x, u: b * u, lambda x, u: x @ x + u @ u, hjb.Box([-9.0], [9.0])),
+        hjb.Grid([-1.5], [1.5], (61,)),
+        lambda solution, b: solution.value_at(jnp.array([1.0])) + 4 * b,
+        0.8,
+        optimiser=optax.lbfgs(),
+        steps=12,
+    )
+    assert abs(found.parameters - 0.5) < 0.005
+    assert abs(found.loss - 4.0) < 0.02
+
+
+TRUE = {"position": 2.0, "velocity": 0.5, "mass": 1.5}
+
+
+def closed_loops(count, seed):
+    """The optimal paths of a mass, by SciPy: cost q₁ x² + q₂ v² + u², m v' = u."""
+    a, b = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1 / TRUE["mass"]]])
+    p = solve_continuous_are(a, b, np.diag([TRUE["position"], TRUE["velocity"]]), np.eye(1))
+    gain = b.T @ p
+    times, draw = np.linspace(0.0, 4.0, 21), np.random.default_rng(seed)
+    for _ in range(count):
+        start = draw.uniform([-0.8, -0.6], [0.8, 0.6])
+        states = solve_ivp(lambda t, x: (a - b @ gain) @ x, (0, 4), start, t_eval=times, rtol=1e-9, atol=1e-9).y.T
+        yield times, states, -states @ gain.T
+
+
+def posed(p):
+    return hjb.Problem(
+        lambda x, u: jnp.stack([x[1], u[0] / p["mass"]]),
+        lambda x, u: p["position"] * x[0] ** 2 + p["velocity"] * x[1] ** 2 + u @ u,
+        hjb.Box([-6.0], [6.0]),
+    )
+
+
+@pytest.mark.slow
+def test_a_mass_and_two_weights_are_recovered_from_twenty_closed_loops():
+    """A hundred steps of Adam; the weight of the velocity has the least influence on the paths and comes last."""
+    found = hjb.fit_trajectories(
+        posed, hjb.Grid([-1.5, -1.5], [1.5, 1.5], (31, 31)), list(closed_loops(20, 3)), dict.fromkeys(TRUE, 1.0),
+        steps=100, bounds=(0.05, 20.0),
+    )  # fmt: skip
+    within = {"mass": 0.02, "position": 0.02, "velocity": 0.06}
+    for name, value in TRUE.items():
+        assert abs(found.parameters[name] / value - 1) < within[name], name

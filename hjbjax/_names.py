@@ -12,6 +12,11 @@ from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, from_hj_reachability, reach, reach_avoid
 from hjbjax.applications.transitions import Transition, transition
+from hjbjax.calibration.design import design
+from hjbjax.calibration.optimisation import Fit, fit
+from hjbjax.calibration.trajectories import fit_trajectories
+from hjbjax.decomposition.combination import BlockSolution
+from hjbjax.decomposition.decompose import Decomposition, decompose
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
@@ -23,6 +28,8 @@ from hjbjax.geometry.lyapunov import lyapunov_check
 from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
 from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
+from hjbjax.linear_games import convex
+from hjbjax.linear_games.hopf import HopfSolution, hopf
 from hjbjax.markov_chain import chain
 from hjbjax.problem.ends import Dirichlet, Neumann, Robin
 from hjbjax.problem.grid import Grid
@@ -50,8 +57,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Ball",
+    "BlockSolution",
     "Box",
     "Checkpoint",
+    "Decomposition",
     "Direct",
     "Dirichlet",
     "Eno2",
@@ -60,8 +69,10 @@ __all__ = [
     "FallbackWarning",
     "FileError",
     "Finite",
+    "Fit",
     "FreeTime",
     "Grid",
+    "HopfSolution",
     "Implicit",
     "Jump",
     "Krylov",
@@ -91,17 +102,23 @@ __all__ = [
     "avoid",
     "chain",
     "convergence_study",
+    "convex",
+    "decompose",
+    "design",
     "discount_rate",
     "dissipation",
     "equilibrium",
     "estimate",
     "expected_exit_time",
     "filtering",
+    "fit",
+    "fit_trajectories",
     "from_gymnasium",
     "from_hj_reachability",
     "geometry",
     "greedy_feedback",
     "hinf_level",
+    "hopf",
     "keep_compiled",
     "least_restrictive",
     "load",

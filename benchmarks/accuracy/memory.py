@@ -15,7 +15,7 @@ import click
 from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table
 
 COLUMNS = ("question", "run", "shape", "told", "peak", "told_over_peak", "seconds", "steps", "status")
-# question, run, nodes per axis, and number of steps or horizon; all in single precision
+# question, run, nodes per axis, and number of steps or horizon; in single precision, the pendulums in double
 CASES: tuple[tuple[str, str, int, float], ...] = (
     ("quadrotor tube", "march, value alone", 21, 0.25),
     ("quadrotor tube", "march, Upwind", 17, 0.02),
@@ -25,9 +25,18 @@ CASES: tuple[tuple[str, str, int, float], ...] = (
     ("quadrotor LQ", "solve, value alone", 21, 3),
     ("Dubins tube", "march, value alone", 361, 0.02),
     ("Dubins tube", "march, Limited", 201, 0.02),
+    ("pendulum", "solve, default", 1600, 50),
+    ("pendulum", "solve, Upwind", 1600, 50),
+    ("pendulum without discount", "solve, default", 1600, 50),
+    ("pendulum without discount", "solve, Upwind", 1600, 50),
+    ("pendulum with noise", "solve, default", 1600, 50),
+    ("pendulum against a disturbance", "solve, default", 1600, 50),
+    ("pendulum against a disturbance", "march, Upwind", 1600, 0.02),
+    ("four pendulums", "solve_batch, default", 800, 50),
 )
 QUICK = 12  # nodes per axis
 SMALL = 6
+SMALL_PENDULUM = 160  # with the coarser grids of the large one
 
 
 @click.command()
@@ -35,9 +44,10 @@ SMALL = 6
 @click.option("--out", type=Folder(), default=RESULTS, help="Folder of the files.")
 def command(quick: bool, out: Path) -> None:
     """Run each large grid in a separate process, and print estimated and measured memory."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for question, run, count, length in CASES[:2] if quick else CASES:
-        about = {"benchmark": "memory", "question": question, "run": run, "dtype": "float32"}
+        dtype = "float64" if "pendulum" in question else "float32"
+        about = {"benchmark": "memory", "question": question, "run": run, "dtype": dtype}
         rows += attempt(lambda case=(question, run, QUICK if quick else count, length): [apart(*case)], about)
         click.echo(f"{question}, {run}: {rows[-1].get('told_over_peak') or rows[-1].get('reason')}", err=True)
     click.echo(table(rows, COLUMNS))
@@ -54,12 +64,14 @@ def apart(question: str, run: str, count: int, length: float) -> dict[str, Any]:
 
 
 def here(question: str, run: str, count: int, length: float) -> dict[str, Any]:
-    """The row of one run in this process."""
-    answer(question, run, SMALL, length)
+    """The row of one run in this process; the solutions of a batch count together."""
+    ask = of_pendulum if "pendulum" in question else answer
+    ask(question, run, SMALL if ask is answer else SMALL_PENDULUM, length)
     before = status("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak counts from now on
-    solution = answer(question, run, count, length)
-    peak, told = status("VmHWM") - before, int(solution.stats["bytes"])
+    found = ask(question, run, count, length)
+    peak, lanes = status("VmHWM") - before, found if isinstance(found, list) else [found]
+    solution, told = lanes[0], sum(int(each.stats["bytes"]) for each in lanes)
     return {
         "shape": list(solution.grid.shape), "nodes": solution.grid.size, "told": told / 1e9, "peak": peak / 1e9,
         "told_bytes_per_node": told / solution.grid.size, "peak_bytes_per_node": peak / solution.grid.size,
@@ -106,6 +118,38 @@ def answer(question: str, run: str, count: int, length: float) -> Any:
         return hjb.march(problem, grid, length, scheme=scheme, policy=not run.endswith("alone"), **options)
     method = hjb.ValueIteration(policy=not run.endswith("alone"))
     return hjb.solve(problem, grid, method=method, max_steps=int(length), **options)
+
+
+def of_pendulum(question: str, run: str, count: int, length: float) -> Any:
+    """The solution of the zoo's pendulum on count x (count + 1) nodes, or the solutions of a batch."""
+    import dataclasses
+    import warnings
+
+    import hjbjax as hjb
+    from benchmarks import cases
+
+    warnings.simplefilter("ignore")
+    if question.endswith("without discount"):
+        problem, grid = cases.undiscounted_pendulum(count)
+    else:
+        problem, grid = cases.pendulum(count, None)
+    if question.endswith("noise"):
+        problem = dataclasses.replace(problem, noise=(0.1, 0.2))
+    if question.endswith("disturbance"):
+        drift, cost = problem.drift, problem.cost
+        problem = dataclasses.replace(
+            problem, drift=lambda x, u, d: drift(x, u + d), cost=lambda x, u, d: cost(x, u),
+            disturbances=hjb.Box([-0.1], [0.1]),
+        )  # fmt: skip
+    scheme = hjb.Upwind() if run.endswith("Upwind") else None
+    if run.startswith("march"):
+        return hjb.march(problem, grid, length, scheme=scheme, throw=False, progress=False)
+    options: dict[str, Any] = {"scheme": scheme, "max_steps": int(length), "throw": False, "progress": False}
+    if question.startswith("four"):
+        rates = [problem.discount * (1 + lane / 10) for lane in range(4)]
+        lanes = [dataclasses.replace(problem, discount=rate) for rate in rates]
+        return hjb.solve_batch(lanes, grid, **options)
+    return hjb.solve(problem, grid, **options)
 
 
 def main(arguments: Sequence[str]) -> None:

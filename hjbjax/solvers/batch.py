@@ -59,6 +59,7 @@ from hjbjax.solvers.setup import (
     check_on_one_state,
     choose,
     choose_scheme,
+    may_raise_order,
     prepare_on_host,
     warn_unreached,
 )
@@ -150,7 +151,9 @@ def solve_batch(
             choices = Choices(scheme=scheme is None, method=method is None, levels=False, tol=free_tol)
             with _naming(members[0]):
                 check_on_one_state(first, grid, on.scheme)
-            needed = memory.require(first, grid, chosen, kind, max_memory)
+            needed = memory.require(
+                first, grid, chosen, kind, max_memory, high_order=may_raise_order(first, chosen, scheme)
+            )
             # a single lane fits, as checked above, so a round is never empty
             for some in _rounds(members, needed, max_memory):
                 with host_loop.with_solution(clock, needed * len(some), lambda _: next(filter(None, solutions), None)):
@@ -160,6 +163,7 @@ def solve_batch(
                     else:
                         together = _solve_side_by_side(members_of, chosen, tol, clock, kept, choices)
                 for index, solution in zip(some, together, strict=True):
+                    solution.stats["bytes"] = needed
                     solutions[index] = solution
     if solutions and not any(solution.status in CUT for solution in solutions):
         solutions[-1] = with_last_phase(solutions[-1], clock)  # catches a late Ctrl-C

@@ -29,12 +29,13 @@ from hjbjax.tracing import checks
 from hjbjax.tracing.dependence import influence
 
 
-def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType) -> int:
+def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, high_order: bool = False) -> int:
     """Bytes that a solve uses at its peak, from a count of the arrays that live at the same time.
 
     The state is the value, the remaining rate and the policy; each evaluation creates the next state while the old one
     lives. Sweeps store the weights (one per axis without noise, two with noise) and the source twice, plain and skewed,
-    in single precision. A Krylov method stores its vectors.
+    in single precision. A Krylov method stores its vectors. With a scheme of high order the state of the monotone
+    iteration lives until the end.
     """
     word, n, actions = np.dtype(dtype).itemsize, len(grid.state_axes), _actions(problem)
     searched, choices = _searched(problem, grid.ndim, dtype), _choices(problem, grid)
@@ -46,7 +47,7 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType) -> in
     # V, its defect, the actions, prescribed values or bounds at the nodes, the least cost if it gives the certificate,
     # and two one-byte masks: the fixed nodes and the counted nodes
     kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
-    kept += word * choices
+    kept += word * (choices + (2 + actions) * high_order)
     look, correction = word * (4 + 2 * actions), 0
     if method.evaluation is not None and not method.relaxes:
         # 2n jumps along the axes and four diagonal ones for each pair of axes
@@ -221,13 +222,15 @@ def _reclaimable(folder: Path) -> int:
     return 0
 
 
-def require(problem: Problem, grid: Grid, method: Method, dtype: DType, limit: int | None) -> int:
+def require(
+    problem: Problem, grid: Grid, method: Method, dtype: DType, limit: int | None, *, high_order: bool = False
+) -> int:
     """The estimated bytes of a solve, if they fit.
 
     Raises:
       MemoryError: the bytes do not fit; reports the estimate, the free memory, and the largest N that fits.
     """
-    return fitting(peak_bytes(problem, grid, method, dtype), grid, limit)
+    return fitting(peak_bytes(problem, grid, method, dtype, high_order=high_order), grid, limit)
 
 
 def fitting(needed: int, grid: Grid, limit: int | None) -> int:

@@ -24,7 +24,7 @@ from hjbjax.solution.status import keeping_warnings
 from hjbjax.solvers import memory, semi_lagrangian
 from hjbjax.solvers.coarse_levels import below
 from hjbjax.solvers.nested_grids import resized
-from hjbjax.solvers.setup import check_on_one_state, choose
+from hjbjax.solvers.setup import check_on_one_state, choose, may_raise_order
 from hjbjax.solvers.stationary import check_arguments, solve
 
 SMALL = 12_000  # nodes of the larger trial grid: about a second, plus compilation
@@ -121,7 +121,7 @@ def estimate(
       >>> import hjbjax as hjb
       >>> problem, grid = hjb.zoo.manipulator(links=2, shape=(200,) * 4)
       >>> hjb.estimate(problem, grid, dtype="float32", measure=False).bytes // grid.size
-      70
+      86
     """
     check_arguments(problem, grid, method, scheme, tol)
     asked, problem = problem, in_own_time(in_unit_box(costs_of(problem), grid.ndim))  # memory does not depend on a sign
@@ -134,7 +134,9 @@ def estimate(
         with own_settings(x64=kind == np.float64):
             needed, programs = semi_lagrangian.arc_bytes(grid, paths.plan(problem, grid, kind), kind), 1
     else:
-        needed, programs = memory.peak_bytes(problem, grid, chosen.inner, kind), _programs(grid, chosen, scheme)
+        high_order = may_raise_order(problem, chosen.inner, scheme)
+        needed = memory.peak_bytes(problem, grid, chosen.inner, kind, high_order=high_order)
+        programs = _programs(grid, chosen, scheme)
     largest = None if free is None else memory.points_per_axis(min(free / needed * grid.size, INDEXABLE - 1), grid)
     about = Estimate(grid.shape, needed, free, largest, programs)
     if not measure:

@@ -104,11 +104,18 @@ def choose_scheme(on: Discretisation, method: Method) -> Scheme:
     V no longer changes, so both use the chain.
     """
     problem, calm = on.problem, Limited().chain
-    if method.relaxes or (is_constrained(problem) and is_discounted(problem) is False):
+    if not may_raise_order(problem, method, None):
         return Upwind()
     if problem.noise is not None and bool(_central(on.with_scheme(calm))):
         return calm
     return Limited()
+
+
+def may_raise_order(problem: Problem, method: Method, scheme: Scheme | None) -> bool:
+    """True if a scheme of high order may follow the chain; without a ``scheme`` and with noise, the nodes decide."""
+    if scheme is not None:
+        return not scheme.monotone
+    return not (method.relaxes or (is_constrained(problem) and is_discounted(problem) is False))
 
 
 @jax.jit

@@ -32,7 +32,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import host_loop, memory, nested_grids, semi_lagrangian, transformed
 from hjbjax.solvers.host_solve import Choices, solve_on_host
 from hjbjax.solvers.result import solution_at_start, with_last_phase
-from hjbjax.solvers.setup import TOL, check_on_one_state, choose
+from hjbjax.solvers.setup import TOL, check_on_one_state, choose, may_raise_order
 from hjbjax.solvers.transformed import Asked
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
@@ -168,7 +168,9 @@ def solve(
     ):
         clock.journal = kept and kept.journal()
         check_on_one_state(problem, grid, on.scheme)  # before the memory check, which reads functions
-        needed = memory.require(problem, grid, method, kind, max_memory)
+        needed = memory.require(
+            problem, grid, method, kind, max_memory, high_order=may_raise_order(problem, method, scheme)
+        )
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = solve_on_host(on, method, tol, guess, clock, choices, mesh)
     solution = with_last_phase(solution, clock)  # after the last write of the checkpoint, which may take long

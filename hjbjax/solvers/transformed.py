@@ -42,7 +42,7 @@ from hjbjax.solvers.contact import contact_axes
 from hjbjax.solvers.host_solve import Choices, settled_on_host
 from hjbjax.solvers.result import finish
 from hjbjax.solvers.semi_lagrangian import REPLACEMENT, Followed, can_replace_chain, finish_arcs
-from hjbjax.solvers.setup import assumptions_of, check_on_one_state, choose, is_bare, prepare
+from hjbjax.solvers.setup import assumptions_of, check_on_one_state, choose, is_bare, may_raise_order, prepare
 
 NOTHING = [[1.0, -np.inf], [1.0, np.inf]]  # an enclosure without information
 
@@ -270,7 +270,9 @@ def _solved(
         method = choose(problem, grid, traced=False, method=method)
         on = Discretisation(problem, grid, asked.scheme or Upwind(subcell=True), asked.inner)
         check_on_one_state(problem, grid, on.scheme)
-        memory.require(problem, grid, method, asked.inner, None)
+        memory.require(
+            problem, grid, method, asked.inner, None, high_order=may_raise_order(problem, method, asked.scheme)
+        )
         try:
             settled, _ = settled_on_host(on, method, float(tol), guess, clock, choices)
         except Stopped as stop:

@@ -113,11 +113,15 @@ def posed(p):
 
 @pytest.mark.slow
 def test_a_mass_and_two_weights_are_recovered_from_twenty_closed_loops():
-    """A hundred steps of Adam; the weight of the velocity has the least influence on the paths and comes last."""
-    found = hjb.fit_trajectories(
-        posed, hjb.Grid([-1.5, -1.5], [1.5, 1.5], (31, 31)), list(closed_loops(20, 3)), dict.fromkeys(TRUE, 1.0),
-        steps=100, bounds=(0.05, 20.0),
-    )  # fmt: skip
-    within = {"mass": 0.02, "position": 0.02, "velocity": 0.06}
-    for name, value in TRUE.items():
-        assert abs(found.parameters[name] / value - 1) < within[name], name
+    """Without noise, and with noise of 5 % of the standard deviation of every state and control."""
+    grid, start = hjb.Grid([-1.5, -1.5], [1.5, 1.5], (31, 31)), dict.fromkeys(TRUE, 1.0)
+    exact, draw = list(closed_loops(20, 3)), np.random.default_rng(1)
+
+    def observed(values):
+        return values + 0.05 * np.std(values) * draw.standard_normal(values.shape)
+
+    noisy = [(times, observed(states), observed(controls)) for times, states, controls in exact]
+    for loops, within in ((exact, 0.02), (noisy, 0.1)):
+        found = hjb.fit_trajectories(posed, grid, loops, start, steps=300, bounds=(0.05, 20.0))
+        for name, value in TRUE.items():
+            assert abs(found.parameters[name] / value - 1) < within, name

@@ -325,7 +325,7 @@ def test_a_march_that_is_resumed_keeps_its_sets(tmp_path):
     assert bare.stopping is None
 
 
-@pytest.mark.parametrize("volatilities", [(0.3, 0.3), (0.2, 0.4)])
+@pytest.mark.parametrize("volatilities", [pytest.param((0.3, 0.3), marks=pytest.mark.slow), (0.2, 0.4)])
 def test_every_mode_has_its_own_boundary(volatilities):
     """With the same volatility in both modes it is that of one put, else between the boundaries of two puts."""
     grid, table = Put().grid(101), np.array(volatilities)

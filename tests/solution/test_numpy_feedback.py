@@ -57,12 +57,16 @@ def places(grid, times):
     return t, x
 
 
+def exported(case, folder):
+    case.export(folder / "exported")  # the suffix is added
+    return numpy_feedback.load(folder / "exported.npz")
+
+
 @pytest.mark.filterwarnings("ignore:Solution:UserWarning")  # states outside
 @pytest.mark.parametrize("name", CASES)
 def test_the_answers_are_the_same(name, tmp_path):
     case, clamp = CASES[name]
-    case.export(tmp_path / "feedback")
-    feedback = numpy_feedback.load(tmp_path / "feedback.npz")
+    feedback = exported(case, tmp_path)
     where = places(case.grid, case.times)
     pairs = {
         "value": (case.value_at, feedback.value),
@@ -79,9 +83,8 @@ def test_the_answers_are_the_same(name, tmp_path):
     assert np.isfinite(answer[:, 0]).sum() > 30
 
 
-def test_a_mode_is_named_or_numbered():
-    case, _ = CASES["marched with modes, a finite set"]
-    feedback = case._feedback
+def test_a_mode_is_named_or_numbered(tmp_path):
+    feedback = exported(CASES["marched with modes, a finite set"][0], tmp_path)
     t, x = 0.4, np.array([0.1, 0.2])
     assert feedback.value(t, x, mode="high") == feedback.value(t, x, mode=1) == feedback.value(t, [1, *x])
     with pytest.raises(ValueError, match=r"got mode = 'medium', wanted one of \('low', 'high'\)"):
@@ -124,7 +127,7 @@ def test_other_files_are_refused(tmp_path):
     }.items():
         with pytest.raises(ValueError, match=why):
             numpy_feedback.load(tmp_path / name)
-    lone = Solution(GRID, np.zeros(GRID.shape), None, code=1)._feedback
+    lone = exported(Solution(GRID, np.zeros(GRID.shape), None, code=1), tmp_path)
     with pytest.raises(ValueError, match="the exported solution has no control"):
         lone.control([0.1, 0.2])
     with pytest.raises(ValueError, match="a batch"):

@@ -79,8 +79,21 @@ class Largest:
         return -jax.hessian(lambda theta: self.dual(theta, mu)[2])(theta)
 
 
+class _WithoutBarrier:
+    """A function whose dual point θ is a state, without constraints."""
+
+    @property
+    def degree(self) -> int:
+        """There is no barrier."""
+        return 0
+
+    def start(self, x: State) -> tuple[Array, Array]:
+        """The state, and no constraint."""
+        return x, jnp.zeros_like(x)
+
+
 @pytree_dataclass(static=("dim",))
-class Quadratic:
+class Quadratic(_WithoutBarrier):
     """½ (y − c)'Q(y − c) + a·y − b with a positive semidefinite Q.
 
     Args:
@@ -99,15 +112,6 @@ class Quadratic:
         """J(x) at one state."""
         return x @ (jnp.asarray(self.matrix) @ x) / 2 + jnp.asarray(self.slope) @ x - self.offset
 
-    @property
-    def degree(self) -> int:
-        """There is no barrier."""
-        return 0
-
-    def start(self, x: State) -> tuple[Array, Array]:
-        """The state, and no constraint."""
-        return x, jnp.zeros_like(x)
-
     def dual(self, theta: Array, mu: Number) -> tuple[Array, Array, Array]:
         """p(θ) = Qθ + a, the gradient at θ, −J*(p) and zero."""
         bent = jnp.asarray(self.matrix, theta.dtype) @ theta
@@ -119,7 +123,7 @@ class Quadratic:
 
 
 @pytree_dataclass(static=("dim",))
-class Smooth:
+class Smooth(_WithoutBarrier):
     """A differentiable function that its user declares convex; made by ``smooth``.
 
     Args:
@@ -133,15 +137,6 @@ class Smooth:
     def __call__(self, x: State) -> Array:
         """J(x) at one state."""
         return self.function(x)
-
-    @property
-    def degree(self) -> int:
-        """There is no barrier."""
-        return 0
-
-    def start(self, x: State) -> tuple[Array, Array]:
-        """The state, and no constraint."""
-        return x, jnp.zeros_like(x)
 
     def dual(self, theta: Array, mu: Number) -> tuple[Array, Array, Array]:
         """p(θ), the gradient at θ, −J*(p) by Fenchel's equality, and zero."""

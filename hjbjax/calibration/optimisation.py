@@ -19,7 +19,7 @@ from hjbjax.problem import arguments
 from hjbjax.problem.pytree import INTERRUPT, front_door, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution import files
-from hjbjax.solution.clock import Clock, noting_interrupts
+from hjbjax.solution.clock import CUT, Clock, noting_interrupts
 from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status, warn
@@ -179,11 +179,11 @@ def fit(
         with progress_bar(progress, {"total": count * (1 + restarts), "desc": "fit"}) as bar:
             for start in [task.start, *(_random_start(task, draw) for _ in range(restarts))]:
                 runs.append(_run(task, start, count, tol, clock, bar))
-                if runs[-1].status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+                if runs[-1].status in CUT:
                     break
         best = min(runs, key=lambda run: run.loss)
         if best.z is None:
-            if best.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+            if best.status in CUT:
                 raise SolveError(f"fit: {best.status}, before the first step was complete")
             raise ValueError(
                 "fit: the loss or its gradient is not finite at the initial parameters. A solve that does not converge "
@@ -191,9 +191,7 @@ def fit(
             )
         found = jax.tree.map(np.asarray, task.parameters(best.z))
         # a run that was cut short leaves a better earlier run as it is, but the fit is not complete
-        status = next(
-            (run.status for run in runs if run.status in (Status.INTERRUPTED, Status.TIME_LIMIT)), best.status
-        )
+        status = next((run.status for run in runs if run.status in CUT), best.status)
     return Fit(
         found, best.loss, np.array(best.history), status, tuple(run.loss for run in runs), error, clock.elapsed()
     )

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from hjbjax.decomposition.combination import BlockSolution
+from hjbjax.decomposition.separation import SUM
 from hjbjax.decomposition.subsystems import FIRST, Blocks, block_problem, find_blocks
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -167,7 +168,7 @@ class Decomposition:
 
     def _combined(self, found: Sequence[Any]) -> BlockSolution:
         """The solutions of the blocks as one."""
-        side = self.problem.payoff if self.rule == "sum" else COST
+        side = self.problem.payoff if self.rule == SUM else COST
         return BlockSolution(
             tuple(found), self.rule, self.bound, self.states, self.controls,
             tuple(each.disturbances for each in self.blocks.blocks), self.problem.labels._replace(payoff=side),

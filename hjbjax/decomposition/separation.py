@@ -89,7 +89,7 @@ def _number(value: Separated, dtype: Any) -> jax.Array:
     return jnp.asarray(number, dtype)
 
 
-def joined(value: Separated, keep: Callable[[Inputs], bool] = lambda inputs: True) -> Any:
+def merged(value: Separated, keep: Callable[[Inputs], bool] = lambda inputs: True) -> Any:
     """The sum, maximum or minimum of the parts whose inputs satisfy a condition; None without any."""
     chosen = [number for inputs, number in value.parts.items() if keep(inputs)]
     total = chosen[0] if chosen else None
@@ -106,7 +106,7 @@ def _numbers(operation: Callable, left: Any, right: Any) -> jax.Array:
 
 def _as_one(value: Separated) -> Separated:
     """The scalar as one number."""
-    return value if value.kind == ONE else Separated(ONE, {value.inputs: joined(value)})
+    return value if value.kind == ONE else Separated(ONE, {value.inputs: merged(value)})
 
 
 def _merge(kind: str, left: Separated, right: Separated) -> Separated:

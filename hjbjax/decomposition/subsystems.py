@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.decomposition.separation import MAX, MIN, NONE, ONE, SUM, Inputs, Separated, joined, separated, structure
+from hjbjax.decomposition.separation import MAX, MIN, NONE, ONE, SUM, Inputs, Separated, merged, separated, structure
 from hjbjax.problem.labels import REWARD
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
@@ -352,7 +352,7 @@ class BlockFunction:
         first: list[int | None] = [None] * self.timed + [0, self.names.n, self.names.n + self.names.m][: len(whole)]
         (value,) = separated(self.function, (*time, *whole), first).reshape(-1)
         keys = self.block.keys | ({NONE} if self.role == "first" else frozenset())
-        found = joined(value, keys.__contains__)
+        found = merged(value, keys.__contains__)
         assert found is not None
         return jnp.asarray(found)
 

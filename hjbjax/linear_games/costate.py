@@ -54,7 +54,7 @@ class Flow(NamedTuple):
     nodes: Any
 
 
-class Answer(NamedTuple):
+class StateSolution(NamedTuple):
     """The result for one state, of the game in which the minimising player is ``own``.
 
     Attributes:
@@ -84,7 +84,7 @@ class _Iterate(NamedTuple):
     done: Any
 
 
-def flow(game: LinearGame, tau: Number, intervals: int, dtype: Any) -> Flow:
+def flow_over(game: LinearGame, tau: Number, intervals: int, dtype: Any) -> Flow:
     """Tables of the dynamics over the time to go ``tau``."""
     a = jnp.asarray(game.drift, dtype)
     n, fine = a.shape[0], FINER * intervals
@@ -106,7 +106,7 @@ def flow(game: LinearGame, tau: Number, intervals: int, dtype: Any) -> Flow:
     )
 
 
-def answer(game: LinearGame, along: Flow, x: State) -> Answer:
+def solve_state(game: LinearGame, along: Flow, x: State) -> StateSolution:
     """Value, bounds and costate at one state."""
     center = along.end @ x + along.drift
     if not game.playing:
@@ -127,7 +127,7 @@ def answer(game: LinearGame, along: Flow, x: State) -> Answer:
     return best._replace(upper=jnp.full_like(best.upper, jnp.inf))
 
 
-def _one_player(game: LinearGame, along: Flow, center: State) -> Answer:
+def _one_player(game: LinearGame, along: Flow, center: State) -> StateSolution:
     """The answer for one player, or for a game in which the player can undo the disturbance."""
     size, smallest = _size(game, along, center)
     begun = _Iterate(game.terminal.start(center)[0], size, 0, False)
@@ -144,7 +144,7 @@ def _one_player(game: LinearGame, along: Flow, center: State) -> Answer:
     value = fixed + p @ center - integral
     value = value + jax.lax.stop_gradient(jnp.minimum(upper - value, 0))
     gap = (upper - discrete) / jnp.where(size > 0, size, 1)
-    return Answer(value, value - slack, jnp.maximum(upper, value - slack), p, _pace(along, mu), gap, found.count)
+    return StateSolution(value, value - slack, jnp.maximum(upper, value - slack), p, _pace(along, mu), gap, found.count)
 
 
 def _pace(along: Flow, mu: Number) -> Array:

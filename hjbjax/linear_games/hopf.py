@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.linear_games import archive, costate
-from hjbjax.linear_games.costate import Answer, Flow
+from hjbjax.linear_games.costate import Flow, StateSolution
 from hjbjax.linear_games.linear_dynamics import LinearGame, linear_game
 from hjbjax.linear_games.support import smooth_support
 from hjbjax.problem import arguments
@@ -305,29 +305,29 @@ def _check_states(name: str, n: int, shape: tuple[int, ...]) -> None:
         raise ValueError(f"HopfSolution.{name}: got states of shape {shape}, wanted (..., {n})")
 
 
-def _value(sign: int, answer: Answer, along: Flow, game: LinearGame) -> jax.Array:
+def _value(sign: int, answer: StateSolution, along: Flow, game: LinearGame) -> jax.Array:
     """V."""
     return sign * answer.value
 
 
-def _bounds(sign: int, answer: Answer, along: Flow, game: LinearGame) -> jax.Array:
+def _bounds(sign: int, answer: StateSolution, along: Flow, game: LinearGame) -> jax.Array:
     """Lower and upper bound of V, shape (2,)."""
     return jnp.stack([answer.lower, answer.upper] if sign > 0 else [-answer.upper, -answer.lower])
 
 
-def _slope(sign: int, answer: Answer, along: Flow, game: LinearGame) -> jax.Array:
+def _slope(sign: int, answer: StateSolution, along: Flow, game: LinearGame) -> jax.Array:
     """DV, the costate at the start of the path."""
     return sign * (along.end.T @ answer.costate)
 
 
-def _control(sign: int, answer: Answer, along: Flow, game: LinearGame) -> Array:
+def _control(sign: int, answer: StateSolution, along: Flow, game: LinearGame) -> Array:
     """The control, which minimises DV·Bu."""
     matrix, admissible = (game.own, game.own_set) if sign > 0 else (game.other, game.other_set)
     w = -_slope(sign, answer, along, game) @ jnp.asarray(matrix, answer.costate.dtype)
     return smooth_support(admissible, w, answer.mu)[1]
 
 
-def _disturbance(sign: int, answer: Answer, along: Flow, game: LinearGame) -> Array:
+def _disturbance(sign: int, answer: StateSolution, along: Flow, game: LinearGame) -> Array:
     """The disturbance, which maximises DV·Cd."""
     matrix, admissible = (game.other, game.other_set) if sign > 0 else (game.own, game.own_set)
     w = _slope(sign, answer, along, game) @ jnp.asarray(matrix, answer.costate.dtype)
@@ -346,10 +346,10 @@ PARTS = {
 def _lanes(solution: HopfSolution, t: Number, x: Array) -> dict[str, Array]:
     """All parts of the answers for states (k, n) at one time, and "gap", the relative gaps, shape (k,)."""
     game = solution.game
-    along = costate.flow(game, solution.horizon - t, solution.intervals, x.dtype)
+    along = costate.flow_over(game, solution.horizon - t, solution.intervals, x.dtype)
 
     def one(x: Array) -> dict[str, Array]:
-        found = costate.answer(game, along, x)
+        found = costate.solve_state(game, along, x)
         sign = -1 if game.negated else 1
         return {"gap": found.gap} | {name: part(sign, found, along, game) for name, part in PARTS.items()}
 

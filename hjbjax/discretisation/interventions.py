@@ -23,7 +23,7 @@ from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.problem.types import Field, Mask, Nodes
 
 Offset = tuple[int, ...]
-ROUNDING = 8  # units of eps in |V|: a smaller distance to the value after an intervention is rounding
+ROUNDING = 8  # units of eps in |c| + |V(x + o)|: a smaller distance of V to their sum is rounding
 
 
 @pytree_dataclass(static=("offsets", "changes", "once"))
@@ -99,16 +99,14 @@ class Interventions:
 
     def impose(self, value: Field) -> Field:
         """V*, and exact equality with the value after an intervention where V is closer to it than rounding."""
-        if not self.pushes:
-            value = self.cheapest(value)
-        after = self.least(value)
-        size = jnp.abs(value) + jnp.abs(after) if self.pushes else jnp.abs(value)
-        near = after - value <= ROUNDING * jnp.finfo(value.dtype).eps * size
-        if not self.pushes:
-            return jnp.where(near, after, value)
-        exact = self.cheapest(
-            jnp.where(near & jnp.isfinite(after), jnp.inf, value)
-        )  # along whole paths, each node from the next one
+        after, size = jnp.full_like(value, jnp.inf), jnp.zeros_like(value)
+        for offset, cost in zip(self.offsets, self.costs, strict=True):
+            ahead = rolled(value, offset)
+            # V may be near zero where neither the cost nor V after the intervention is
+            size = jnp.where(cost + ahead < after, jnp.abs(cost) + jnp.abs(ahead), size)
+            after = jnp.minimum(after, cost + ahead)
+        near = jnp.isfinite(after) & (after - value <= ROUNDING * jnp.finfo(value.dtype).eps * size)
+        exact = self.cheapest(jnp.where(near, jnp.inf, value))  # along whole paths, each node from the next one
         return jnp.where(jnp.isfinite(exact), exact, value)
 
     def chosen(self, worth: Field, value: Field) -> list[jax.Array]:

@@ -483,7 +483,10 @@ def _march_traced(
         fine &= ok & jnp.all(jnp.isfinite(value))
         values.append(value)
         pair = time_stepping.greedy_actions(task, value, end)
-        actions.append(adjoint.attach_actions(on.at(end), pair, value, jnp.logical_not(task.obstacles_at(end).ended)))
+        if not on.players.exact:  # the result of a search has no derivative of its own, that of a formula has all
+            acting = jnp.logical_not(task.obstacles_at(end).ended)
+            pair = adjoint.attach_actions(on.at(end), pair, value, acting)
+        actions.append(pair)
         touching.append(contact(problem, grid, task.obstacles_at(end), value))
     u, d = (
         jnp.stack(

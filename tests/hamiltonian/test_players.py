@@ -49,6 +49,7 @@ def test_a_derivative_rule_of_the_users_moves_no_optimum(drift, cost, controls, 
     assert value_of(drift, cost, controls) == pytest.approx(plain, abs=3e-6)
 
 
+@pytest.mark.slow
 def test_a_derivative_rule_of_the_users_moves_no_worst_disturbance():
     def march(seen):
         problem = hjb.Problem(

@@ -154,6 +154,7 @@ def test_each_warning_comes_alone():
     assert len(said) == 1
 
 
+@pytest.mark.slow
 def test_the_filter_warns_outside_jit_alone():
     observer = GridFilter(WALK, place, Grid([-3.0], [3.0], (61,)), lambda x: jnp.exp(-x @ x), measurement_noise=1e-3)
     told = np.zeros(0), np.array([0.4e-2]), 1e-2

@@ -25,8 +25,7 @@ def assert_certified(found, exact, seed):
 
 @pytest.mark.parametrize(
     ("kind", "count"),
-    [(kind, 1) for kind in KINDS]
-    + [pytest.param(kind, 2, marks=[pytest.mark.slow] * (kind != "noise")) for kind in KINDS],
+    [(kind, 1) for kind in KINDS] + [pytest.param(kind, 2, marks=pytest.mark.slow) for kind in KINDS],
 )
 def test_random_problems_agree_with_a_dense_dynamic_program(kind, count):
     for seed in range(3):
@@ -226,6 +225,7 @@ def test_a_crash_lowers_the_share_of_a_fund_as_its_equation_says():
     assert found.value_at([0.0]) == pytest.approx(growth / 0.1**2, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_probability_of_ruin_is_that_of_erlang():
     # claims of size one at the rate λ, premiums at the rate c: the ladder formula for the probability of survival
     rate, premium, top = 0.5, 0.7, 6.0

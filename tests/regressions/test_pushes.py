@@ -249,6 +249,7 @@ def test_simulated_means_agree_with_the_value():
             assert abs(np.mean(earned) - found.value_at([start])) <= noise + 0.005 + 0.014
 
 
+@pytest.mark.slow
 def test_a_path_jumps_to_the_barrier_and_stays_below():
     found = hjb.solve(firm(), LINE, tol=1e-8)
     path = hjb.simulate(firm(), found, [1.2], 3.0, key=1)
@@ -283,6 +284,7 @@ def regimes(*, noise=None, rates=None, discount=0.5):
 WIDE = hjb.Grid([-2.0], [2.0], (201,))
 
 
+@pytest.mark.slow
 def test_a_path_with_modes_and_pushes_costs_its_value():
     problem = regimes()
     found = hjb.solve(problem, WIDE, tol=1e-8)

@@ -71,7 +71,7 @@ def test_open_ends_assume_a_parabola():
     assert said
 
 
-@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_linear_quadratic_problems_on_the_whole_space(n):
     """Next to the ends, where optimal paths leave the box, the estimate is the error; in the middle both are small."""
     a = np.array([[0.0, 1.0], [0.0, 0.0]])[-n:, -n:] + 0.3 * np.eye(n)

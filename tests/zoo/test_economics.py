@@ -164,6 +164,7 @@ def shot(firm, barrier):
     return solve_ivp(ode, (barrier, 0.0), [barrier + least, 1.0], rtol=1e-11, atol=1e-13, dense_output=True).sol
 
 
+@pytest.mark.slow
 def test_a_firm_is_liquidated_as_in_bolton_chen_and_wang():
     problem, grid = zoo.liquidation()
     found, firm = hjb.solve(problem, grid), zoo.ConstrainedFirm()

@@ -47,6 +47,7 @@ from hjbjax.zoo.minimum_time import (
     zermelo,
     zermelo_exact,
 )
+from hjbjax.zoo.pursuit import Adrift, Chase, adrift_exact, pursuit
 from hjbjax.zoo.shortest_paths import Dubins, SingleIntegrator, dubins, eikonal, eikonal_exact
 from hjbjax.zoo.stochastic import (
     BangBang,
@@ -67,6 +68,7 @@ from hjbjax.zoo.stopping import (
     perpetual_put_exact,
 )
 from hjbjax.zoo.switching import Saving, Thermostat, saving, thermostat
+from hjbjax.zoo.transaction_costs import Portfolio, transaction_costs
 
 _ENTRIES = (
     # slightly off the hanging position θ = π, where swinging up to the left and to the right cost the same
@@ -200,6 +202,14 @@ _ENTRIES = (
         duration=10.0,
     ),
     Entry(
+        "transaction-costs",
+        "consume and invest where every trade costs a share of its size",
+        transaction_costs,
+        # almost all in bonds, so the path starts with a purchase
+        start=(0.1,),
+        duration=20.0,
+    ),
+    Entry(
         "liquidation",
         "investment and payout of a firm that is liquidated without cash",
         liquidation,
@@ -234,6 +244,15 @@ _ENTRIES = (
         mode="off",
     ),
     Entry(
+        "pursuit",
+        "catch a swimmer with a boat whose rudder breaks at random",
+        pursuit,
+        # behind the swimmer, on a course away from him
+        start=(1.0, 2.5),
+        duration=6.0,
+        mode="steers",
+    ),
+    Entry(
         "moon-landing",
         "land a rocket with the least fuel: when to start the engine",
         moon_landing,
@@ -250,12 +269,14 @@ _ENTRIES = (
 catalogue: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
 
 __all__ = [
+    "Adrift",
     "AmericanPut",
     "Angle",
     "BallAndBeam",
     "BangBang",
     "Boat",
     "CarWithTrailers",
+    "Chase",
     "ConstrainedFirm",
     "DoubleIntegrator",
     "Dubins",
@@ -270,6 +291,7 @@ __all__ = [
     "Pendulum",
     "PlanarQuadrotor",
     "Pomet",
+    "Portfolio",
     "Ramsey",
     "Refinancing",
     "Reserve",
@@ -280,6 +302,7 @@ __all__ = [
     "Unicycle",
     "VanDerPol",
     "Wealth",
+    "adrift_exact",
     "american_put",
     "bang_bang",
     "bang_bang_exact",
@@ -316,6 +339,7 @@ __all__ = [
     "pendulum_near_upright",
     "perpetual_put",
     "perpetual_put_exact",
+    "pursuit",
     "refinancing",
     "saving",
     "smooth",
@@ -323,6 +347,7 @@ __all__ = [
     "stochastic_lq",
     "stochastic_lq_exact",
     "thermostat",
+    "transaction_costs",
     "van_der_pol",
     "zermelo",
     "zermelo_exact",

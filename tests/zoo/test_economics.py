@@ -211,3 +211,60 @@ def test_a_firm_issues_equity_as_in_bolton_chen_and_wang():
     path = hjb.simulate(problem, found, [0.02], 3.0, mode="operating", key=3)
     assert path.status.name == "DURATION"
     assert np.all(path.states[:, 0] <= barrier + grid.spacing(0))
+
+
+def free_of_trade(investor):
+    """The ends of the interval without trade, and the value there as a function of the share.
+
+    By shooting: q = V′ follows the equation from a purchase at the lower end, with q and q′ those of the marginal cost.
+    The lower end is right if q then just touches the marginal cost of a sale.
+    """
+    r, a, sigma, rho = investor.interest, investor.growth, investor.volatility, investor.discount
+    buy, sell = investor.buying, investor.selling
+
+    def value(z, q, slope):
+        """V from the equation, with the best consumption 1/(1/ρ − z q)."""
+        k = 1 / (1 / rho - z * q)
+        reward = np.log(k) + (r + z * (a - r) - k - sigma**2 * z**2 / 2) / rho
+        drift = z * (1 - z) * (a - r - sigma**2 * z) + k * z
+        return (reward + drift * q + 0.5 * (sigma * z * (1 - z)) ** 2 * slope) / rho
+
+    def ode(z, y):
+        v, q = y
+        return [q, (v - value(z, q, 0.0)) * rho / (0.5 * (sigma * z * (1 - z)) ** 2)]
+
+    def path(low):
+        q = buy / (rho * (1 + buy * low))
+        start = [value(low, q, -(buy**2) / (rho * (1 + buy * low) ** 2)), q]
+        return solve_ivp(ode, (low, 0.99), start, rtol=1e-11, atol=1e-12, dense_output=True).sol
+
+    def above(low):
+        """q less the marginal cost of a sale: its least distance, and where."""
+        z, found = np.linspace(low, 0.99, 20_001), path(low)
+        gap = found(z)[1] + sell / (rho * (1 - sell * z))
+        least = np.argmin(gap[: np.argmax(gap < -0.5 * sell / rho) or None])
+        return gap[least], z[least]
+
+    share = investor.share
+    low = brentq(lambda low: above(low)[0], 0.3 * share, 0.99 * share, xtol=1e-10)
+    return low, above(low)[1], lambda z: path(low)(z)[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("numbers", [{}, {"buying": 0.03, "selling": 0.002}, {"growth": 0.08, "discount": 0.1}])
+def test_an_investor_trades_outside_of_the_interval_of_the_equation(numbers):
+    investor = zoo.Portfolio(**numbers)
+    low, high, value = free_of_trade(investor)
+    problem, grid = zoo.transaction_costs(**numbers)
+    solution = hjb.solve(problem, grid)
+    np.testing.assert_allclose(solution.free_boundary(), [low, high], atol=np.diff(grid.axis(0))[0])
+    waits = (grid.axis(0) > low) & (grid.axis(0) < high)
+    np.testing.assert_allclose(solution.value[waits], value(grid.axis(0)[waits]), atol=1e-3)
+    assert low < investor.share < high
+
+
+def test_an_investor_who_would_borrow_is_refused():
+    with pytest.raises(ValueError, match="share of stock without costs"):
+        zoo.transaction_costs(growth=0.2)
+    with pytest.raises(ValueError, match="below 1"):
+        zoo.transaction_costs(selling=1.5)

@@ -315,7 +315,7 @@ def plot_values(problem: Problem, solution: Solution, fixed: dict[int, float], j
     for ax, part in zip(axes_of_parts, parts, strict=True):
         drawn = plotting.value(part.solution, ax=ax, fixed=fixed, target=part.target)
         with_curve(drawn, part.solution, fixed, jumps)
-        ax.set_title(part.title)
+        _name_mode(ax, part.title)
     return figure
 
 
@@ -328,8 +328,15 @@ def plot_policies(problem: Problem, solution: Solution, fixed: dict[int, float],
     for ax, (part, input) in zip(axes_of_inputs, inputs, strict=True):
         drawn = plotting.policy(part.solution, input=input, fixed=fixed, ax=ax)
         with_curve(drawn, part.solution, fixed, jumps, input)
-        ax.set_title(part.title)
+        _name_mode(ax, part.title)
     return figure
+
+
+def _name_mode(ax: "Axes", mode: str) -> None:
+    """Write the mode in front of the caption, at the right end, since the legend is at the left one."""
+    if mode:
+        caption = ax.get_title("right")
+        ax.set_title(f"{mode}, {caption}" if caption else mode, loc="right", fontsize=9)
 
 
 def _panels(titles: Sequence[str]) -> tuple["Figure", list["Axes"]]:

@@ -120,10 +120,10 @@ def test_two_states_with_modes_have_one_panel_per_mode():
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (11, 11))
     solution = hjb.solve(problem, grid, scheme=hjb.Upwind(), tol=1e-3)
     figure = run_folder.plot_values(problem, solution, {}, False)
-    titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
+    titles = [ax.get_title("right") for ax in figure.axes if ax.get_title("right")]
     assert titles == ["mode calm", "mode wild"]
     figure = run_folder.plot_policies(problem, solution, {}, False)
-    titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
+    titles = [ax.get_title("right") for ax in figure.axes if ax.get_title("right")]
     assert titles == ["mode calm", "mode wild"] * 2
     report = run_folder.json_report(solution, None, [])
     assert report["modes"] == ["calm", "wild"]

@@ -12,6 +12,7 @@ Options that only log, and options that choose a device or random numbers, stay 
 import contextlib
 import operator
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 
@@ -33,6 +34,36 @@ def refuse_error_checks(caller: str) -> None:
             )
 
 
+# option: its context manager, the value that the package requires, and other values that mean the same
+_REQUIRED: dict[str, tuple[Any, Any, tuple]] = {
+    # infinity and NaN are valid values: an unreachable state costs infinity, a node in the target has no control
+    "jax_debug_nans": (jax.debug_nans, False, ()),
+    "jax_debug_infs": (jax.debug_infs, False, ()),
+    # integers and floats are mixed on purpose, as are scalars and arrays
+    "jax_numpy_dtype_promotion": (jax.numpy_dtype_promotion, "standard", ()),
+    "jax_numpy_rank_promotion": (jax.numpy_rank_promotion, "allow", ()),
+    # grids and results are NumPy arrays, which are transferred to the device and back
+    "jax_transfer_guard_host_to_device": (jax.transfer_guard_host_to_device, "allow", (None,)),
+    "jax_transfer_guard_device_to_device": (jax.transfer_guard_device_to_device, "allow", (None,)),
+    "jax_transfer_guard_device_to_host": (jax.transfer_guard_device_to_host, "allow", (None,)),
+    # diffrax keeps traces alive in its caches, and draws the same Brownian path again from the same keys
+    "jax_check_tracer_leaks": (jax.check_tracer_leaks, False, ()),
+    "jax_debug_key_reuse": (jax.debug_key_reuse, False, ()),
+    # without jit every sweep over a grid would be a loop in Python
+    "jax_disable_jit": (jax.disable_jit, False, ()),
+    # callers forbid traces or runs of their own programs; every solve traces and runs functions of its problem
+    "jax_no_tracing": (jax.no_tracing, False, ()),
+    "jax_no_execution": (jax.no_execution, False, ()),
+}
+_found = operator.attrgetter(*_REQUIRED)
+
+
+def _to_change() -> list[tuple[Any, Any]]:
+    """The context managers of the options that the caller has set to another value, and the required values."""
+    pairs = zip(_REQUIRED.values(), _found(jax.config), strict=True)
+    return [(set_to, value) for (set_to, value, others), found in pairs if found != value and found not in others]
+
+
 @contextlib.contextmanager
 def own_settings(*, x64: bool | None = None) -> Iterator[None]:
     """Context manager and decorator that sets the JAX options of the package; takes about ten microseconds.
@@ -40,42 +71,16 @@ def own_settings(*, x64: bool | None = None) -> Iterator[None]:
     Args:
       x64: 64-bit types on or off; ``None`` keeps the caller's choice, as a trace requires.
     """
-    with (
-        # infinity and NaN are valid values: an unreachable state costs infinity, a node in the target has no control
-        jax.debug_nans(False),
-        jax.debug_infs(False),
-        # integers and floats are mixed on purpose, as are scalars and arrays
-        jax.numpy_dtype_promotion("standard"),
-        jax.numpy_rank_promotion("allow"),
-        # grids and results are NumPy arrays, which are transferred to the device and back
-        jax.transfer_guard_host_to_device("allow"),
-        jax.transfer_guard_device_to_device("allow"),
-        jax.transfer_guard_device_to_host("allow"),
-        # diffrax keeps traces alive in its caches, and draws the same Brownian path again from the same keys
-        jax.check_tracer_leaks(False),
-        jax.debug_key_reuse(False),
+    with contextlib.ExitStack() as stack:
+        for set_to, value in _to_change():
+            stack.enter_context(set_to(value))
         # products of float32 matrices would otherwise keep only 8 to 11 bits on an accelerator
-        jax.default_matmul_precision("highest"),
-        # without jit every sweep over a grid would be a loop in Python
-        jax.disable_jit(False),
-        # callers forbid traces or runs of their own programs; every solve traces and runs functions of its problem
-        jax.no_tracing(False),
-        jax.no_execution(False),
-        contextlib.nullcontext() if x64 is None else jax.enable_x64(x64),
-    ):
+        stack.enter_context(jax.default_matmul_precision("highest"))
+        if x64 is not None:
+            stack.enter_context(jax.enable_x64(x64))
         yield
 
 
-# the options of ``own_settings`` that matter to a lookup between nodes, and their usual values
-_USUAL = {
-    "jax_debug_nans": False, "jax_debug_infs": False, "jax_numpy_dtype_promotion": "standard",
-    "jax_numpy_rank_promotion": "allow", "jax_check_tracer_leaks": False, "jax_disable_jit": False,
-    "jax_no_tracing": False, "jax_no_execution": False, "jax_transfer_guard_host_to_device": None,
-    "jax_transfer_guard_device_to_device": None, "jax_transfer_guard_device_to_host": None,
-}  # fmt: skip
-_options, _usual = operator.attrgetter(*_USUAL), tuple(_USUAL.values())
-
-
 def are_usual() -> bool:
-    """True with the usual options of JAX, so that a lookup between nodes need not set its own; takes a microsecond."""
-    return bool(_options(jax.config) == _usual)
+    """True if a lookup between nodes, which has no product of matrices, need not set any option."""
+    return not _to_change()

@@ -1,0 +1,103 @@
+"""Values that contain a network and meet the data of a problem exactly, for any weights.
+
+    rest point    V(x) = V₂(y) + |y|² N(y)             y = x − x̄, N(0) = 0
+    horizon       V(t, x) = ψ(x) + (1 − t/T) (c + s N(t, x, ψ(x)))
+
+V₂ = w̄ + p̄·y + ½ y'Py is the linear-quadratic solution at the rest point x̄. The network changes neither the value nor
+the first two derivatives there, and |·|² is the norm of P itself, so the network is a relative correction. Under a
+horizon T the value is the terminal cost ψ at t = T. The terminal cost is also an input of the network, which then needs
+few weights for a value that is similar to a smoother ψ.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.neural.network import Weights, evaluate_network
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import pytree_dataclass
+from hjbjax.problem.types import Number, Scalar, State
+
+FLOOR = 0.01  # the least eigenvalue of the norm of the correction relative to the largest, in units of the box
+
+
+@pytree_dataclass()
+class RestAnsatz:
+    """The value near a rest point, with a network.
+
+    Args:
+      weights: the weights of the network.
+      state: the rest point x̄, shape (n,).
+      costate: p̄, shape (n,).
+      value: w̄.
+      matrix: P, shape (n, n).
+      norm: the matrix of |y|², positive definite, shape (n, n).
+      size: half the widths of the box, shape (n,).
+    """
+
+    weights: Weights
+    state: Any
+    costate: Any
+    value: Any
+    matrix: Any
+    norm: Any
+    size: Any
+
+    def __call__(self, problem: Problem | None, t: Number, x: State) -> Scalar:
+        """V at one state."""
+        y = x - self.state
+        near = self.value + self.costate @ y + y @ (self.matrix @ y) / 2
+        shape = evaluate_network(self.weights, y / self.size) - evaluate_network(self.weights, jnp.zeros_like(y))
+        return jnp.asarray(near + (y @ (self.norm @ y)) * shape)
+
+
+def norm_of(matrix: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """½ |P| as a positive definite matrix: the absolute eigenvalues in units of the box, with a floor."""
+    sizes, vectors = np.linalg.eigh(matrix * np.outer(size, size) / 2)
+    largest = float(np.max(np.abs(sizes), initial=0.0)) or 1.0
+    scaled = (vectors * np.maximum(np.abs(sizes), FLOOR * largest)) @ vectors.T
+    return scaled / np.outer(size, size)
+
+
+@pytree_dataclass()
+class HorizonAnsatz:
+    """The value over a horizon, with a network.
+
+    Args:
+      weights: the weights of the network.
+      horizon: T, in units of time.
+      center: the middle of the states, shape (n,).
+      size: the spread of the states, shape (n,).
+      middle: the middle of ψ.
+      spread: the spread of ψ.
+      scale: s, the size of the difference of V and ψ.
+      offset: c.
+    """
+
+    weights: Weights
+    horizon: Any
+    center: Any
+    size: Any
+    middle: Any
+    spread: Any
+    scale: Any
+    offset: Any
+
+    def __call__(self, problem: Problem, t: Number, x: State) -> Scalar:
+        """V at one time and state."""
+        paid = terminal_cost(problem, self.horizon, x)
+        left = 1 - jnp.asarray(t, x.dtype) / self.horizon
+        inputs = jnp.concatenate(
+            [jnp.stack([2 * left - 1, (paid - self.middle) / self.spread]), (x - self.center) / self.size]
+        )
+        return paid + left * (self.offset + self.scale * evaluate_network(self.weights, inputs))
+
+
+def terminal_cost(problem: Problem, t: Number, x: State) -> jax.Array:
+    """ψ at one state; zero without a terminal cost."""
+    paid = problem.terminal_cost
+    if callable(paid):
+        paid = paid(*problem.state_arguments(x, t))
+    return jnp.asarray(0.0 if paid is None else paid, x.dtype)

@@ -1,0 +1,264 @@
+"""The value of a network with its problem, ``NeuralSolution``: lookups, files, and errors on held-out data."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.hamiltonian import pointwise
+from hjbjax.hamiltonian.pointwise import Rule
+from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass
+from hjbjax.problem.settings import own_settings
+from hjbjax.problem.types import Array, Number, Numbers, Scalar, State
+from hjbjax.solution import files
+from hjbjax.solution.placement import FileError, Path
+from hjbjax.solution.status import Status
+from hjbjax.tracing import checks, closures
+
+FORMAT, VERSION = "hjbjax.NeuralSolution", 1
+BLOCKS = (1, 32, 1024)  # the numbers of states of one compiled program
+MESSAGES = {
+    Status.CONVERGED: "The error on held-out data is below tol.",
+    Status.MAX_STEPS: "Reached the number of steps with a held-out error above tol. Raise steps, or pass guess=.",
+    Status.NONFINITE: "The held-out error became NaN or infinite; the best weights are kept. Lower rate.",
+    Status.INTERRUPTED: "The training was interrupted; the best weights are kept. Continue with guess=.",
+    Status.TIME_LIMIT: "Reached time_limit; the best weights are kept. Continue with guess=.",
+}
+
+
+@pytree_dataclass(static=("rule",), host=("code", "validation", "history", "seconds"))
+class NeuralSolution:
+    """A value given by a network, made by ``neural.solve`` and ``neural.deep_bsde``.
+
+    It can be called like a feedback and passed to ``simulate`` and ``greedy_feedback``. Results are float64 NumPy for
+    numbers; under ``jit``, ``vmap`` and ``grad`` they follow the dtype of the state.
+
+    Args:
+      ansatz: the network, and the data of the problem that it meets.
+      lo: lower corner of the box of the training states, shape (n,).
+      hi: upper corner, shape (n,).
+      problem: the problem; ``None`` for a file that was loaded without it.
+      rule: the method for the minimum of the Hamiltonian.
+      code: a ``Status`` number; host data, like the arguments below.
+      validation: errors on held-out data by name; see the function that made the solution.
+      history: the held-out error before training and after every 25 steps, shape (k,).
+      seconds: the duration.
+    """
+
+    ansatz: Any
+    lo: Any
+    hi: Any
+    problem: Problem | None
+    rule: Rule | None = None
+    code: int = int(Status.CONVERGED)
+    validation: Any = None
+    history: Any = None
+    seconds: float = 0.0
+
+    @property
+    def status(self) -> Status:
+        """CONVERGED, MAX_STEPS, NONFINITE, INTERRUPTED or TIME_LIMIT."""
+        return Status(int(self.code))
+
+    @property
+    def message(self) -> str:
+        """The outcome and the remedy in one or two sentences."""
+        return MESSAGES.get(self.status, self.status.message)
+
+    @property
+    def horizon(self) -> Any:
+        """T, in units of time; ``None`` for a stationary value."""
+        return self.ansatz.horizon if isinstance(self.ansatz, HorizonAnsatz) else None
+
+    def value_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
+        """V: ``value_at(x)``, or ``value_at(t, x)`` over a horizon.
+
+        Args:
+          where: states x, shape (n,) or (..., n); over a horizon preceded by times, a number or shape (...).
+          clamp: use the nearest point for states outside the box of the training; otherwise NaN.
+
+        Returns:
+          Shape ``x.shape[:-1]``, in cost units.
+
+        Raises:
+          ValueError: states of the wrong length, or a missing time.
+        """
+        return self._evaluate("value_at", where, clamp)
+
+    def costate_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
+        """DV, the exact gradient of ``value_at``, shape ``x.shape[:-1] + (n,)``; arguments as for ``value_at``."""
+        return self._evaluate("costate_at", where, clamp)
+
+    def control_at(self, *where: Numbers | Sequence, clamp: bool = True) -> Any:
+        """The control that minimises the Hamiltonian, shape ``x.shape[:-1] + (m,)``.
+
+        Outside the box of the training it is the control of the nearest point, unless ``clamp`` is False.
+
+        Raises:
+          ValueError: the problem has no controls, or the solution was loaded without its problem.
+        """
+        if self.problem is None:
+            raise ValueError("NeuralSolution.control_at: the problem is missing; pass it: NeuralSolution.load(path, problem)")
+        if self.problem.controls is None:
+            raise ValueError("NeuralSolution.control_at: the problem has no controls")
+        return self._evaluate("control_at", where, clamp)
+
+    def __call__(self, *where: Numbers | Sequence) -> Any:
+        """The control, as ``control_at``."""
+        return self.control_at(*where)
+
+    def save(self, path: Path, *, force: bool = False) -> None:
+        """Write the weights and the errors to ``path`` atomically; ``NeuralSolution.load`` reads them.
+
+        Args:
+          path: the file.
+          force: replace an existing file.
+
+        Raises:
+          FileExistsError: the file exists, without ``force``.
+          FileError: the file cannot be written.
+          ValueError: the solution is traced.
+        """
+        if is_traced(self):
+            raise ValueError("NeuralSolution.save: got a traced solution; save it outside of jit, vmap and grad")
+        fields = {name: each for name, each in vars(self.ansatz).items() if name != "weights"}
+        arrays = {name: np.asarray(each, float) for name, each in fields.items()}
+        for i, (matrix, bias) in enumerate(self.ansatz.weights):
+            arrays |= {f"matrix{i}": np.asarray(matrix, float), f"bias{i}": np.asarray(bias, float)}
+        header = {
+            "format": FORMAT, "version": VERSION, "ansatz": type(self.ansatz).__name__, "fields": list(fields),
+            "layers": len(self.ansatz.weights), "status": int(self.code), "validation": self.validation or {},
+            "seconds": self.seconds,
+        }  # fmt: skip
+        arrays |= {"lo": np.asarray(self.lo, float), "hi": np.asarray(self.hi, float)}
+        history = np.zeros(0) if self.history is None else np.asarray(self.history, float)
+        files.write(path, header, {**arrays, "history": history}, force=force)
+
+    @classmethod
+    def load(cls, path: Path, problem: Problem | None = None) -> "NeuralSolution":
+        """The solution in a file written by ``save``.
+
+        Args:
+          path: the file.
+          problem: the problem, which a file cannot hold. Needed for controls, and for values over a horizon, which
+            contain the terminal cost.
+
+        Raises:
+          FileError: the file is missing, damaged or foreign.
+        """
+        found = files.read(path, FORMAT, VERSION, _plan, _from_file)
+        return found if problem is None else with_problem(found, problem)
+
+    def _evaluate(self, name: str, where: tuple, clamp: bool) -> Any:
+        """One of the lookups at states (..., n)."""
+        timed, n = self.horizon is not None, np.shape(self.lo)[-1]
+        if len(where) != 1 + timed:
+            wanted = "(t, x): the value depends on time" if timed else "(x): the value does not depend on time"
+            raise ValueError(f"NeuralSolution.{name}: got {len(where)} arguments, wanted {wanted}")
+        if timed and self.problem is None:
+            raise ValueError(f"NeuralSolution.{name}: the terminal cost is missing; pass the problem to load")
+        traced = is_traced(self, where)
+        xp: Any = jnp if traced else np
+        t, x = where if timed else (0.0, where[0])
+        x = xp.asarray(x) if traced else np.asarray(x, float)
+        if not x.shape or x.shape[-1] != n:
+            raise ValueError(f"NeuralSolution.{name}: got states of shape {x.shape}, wanted (..., {n})")
+        x = x if xp.issubdtype(x.dtype, xp.floating) else x.astype(float)
+        t = xp.asarray(t, x.dtype)
+        shape = np.broadcast_shapes(t.shape, x.shape[:-1])
+        t, x = xp.broadcast_to(t, shape).reshape(-1), xp.broadcast_to(x, (*shape, n)).reshape(-1, n)
+        if traced:
+            found = _lanes(as_jax(self), name, clamp, t, x)
+        else:
+            with own_settings(x64=True):
+                found = _in_blocks(cast(self, np.float64), name, clamp, t, x)
+        return found.reshape((*shape, *found.shape[1:]))
+
+    def __repr__(self) -> str:
+        over = "" if self.horizon is None or is_traced(self.horizon) else f" over {float(self.horizon):g}"
+        return f"NeuralSolution({self.status}, {np.shape(self.lo)[-1]} states{over})"
+
+    def __str__(self) -> str:
+        lines = [f"{self.status}: {self.message}"]
+        lines += [f"  {name.replace('_', ' '):<16} {value:.4g}" for name, value in (self.validation or {}).items()]
+        return "\n".join([*lines, f"  {'seconds':<16} {self.seconds:.3g}"])
+
+
+def value_of(solution: NeuralSolution, t: Number, x: State) -> Scalar:
+    """V at one state."""
+    return solution.ansatz(solution.problem, t, x)
+
+
+def _lanes(solution: NeuralSolution, name: str, clamp: bool, t: Array, x: Array) -> jax.Array:
+    """A lookup at times (k,) and states (k, n)."""
+    lo, hi = (jnp.asarray(corner, x.dtype) for corner in (solution.lo, solution.hi))
+
+    def one(t: Number, x: State) -> jax.Array:
+        near = jnp.clip(x, lo, hi)
+        if name == "value_at":
+            found = value_of(solution, t, near)
+        else:
+            found = jax.grad(value_of, 2)(solution, t, near)
+            if name == "control_at":
+                assert solution.problem is not None
+                assert solution.rule is not None
+                found = pointwise.minimiser(solution.problem, solution.rule, t, near, found)
+        return found if clamp else jnp.where(jnp.all(near == x), found, jnp.nan)
+
+    return jax.vmap(one)(t, x)
+
+
+_compiled = functools.partial(jax.jit, static_argnames=("name", "clamp"))(_lanes)
+
+
+def _in_blocks(solution: NeuralSolution, name: str, clamp: bool, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The same in blocks of few different sizes, because each size is another program."""
+    block = next((size for size in BLOCKS if size >= len(x)), BLOCKS[-1])
+    parts = []
+    for first in range(0, max(len(x), 1), block):
+        rows = np.arange(first, min(first + block, len(x)))
+        if not len(rows):
+            raise ValueError(f"NeuralSolution.{name}: got no states")
+        filled = np.resize(rows, block)
+        parts.append(np.asarray(_compiled(solution, name, clamp, t[filled], x[filled]))[: len(rows)])
+    return np.concatenate(parts)
+
+
+def with_problem(solution: NeuralSolution, problem: Problem) -> NeuralSolution:
+    """The solution with the problem of its controls, after checks."""
+    n = np.shape(solution.lo)[-1]
+    checks.of_one_state(problem, n, "the number of states of the file")
+    problem = closures.settled(problem, n)
+    rule = None if problem.controls is None else pointwise.rule_of(problem, n)
+    return NeuralSolution(
+        solution.ansatz, solution.lo, solution.hi, problem, rule, solution.code, solution.validation, solution.history,
+        solution.seconds,
+    )  # fmt: skip
+
+
+def _plan(header: dict) -> dict[str, files.Expected]:
+    """The arrays of a file."""
+    shapes = tuple((None,) * axes for axes in range(3))
+    names = [*header["fields"], "lo", "hi", "history"]
+    for i in range(header["layers"]):
+        names += [f"matrix{i}", f"bias{i}"]
+    return {name: files.Expected(shapes, (np.float64,), optional=False) for name in names}
+
+
+def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> NeuralSolution:
+    """The solution with the header and the arrays of a file."""
+    kinds: dict[str, Any] = {kind.__name__: kind for kind in (RestAnsatz, HorizonAnsatz)}
+    if header["ansatz"] not in kinds:
+        raise FileError(f"its ansatz {header['ansatz']!r} is not known here: update hjbjax")
+    weights = tuple((arrays[f"matrix{i}"], arrays[f"bias{i}"]) for i in range(header["layers"]))
+    ansatz = kinds[header["ansatz"]](weights, **{name: arrays[name] for name in header["fields"]})
+    validation = {name: float(value) for name, value in header["validation"].items()}
+    return NeuralSolution(
+        ansatz, arrays["lo"], arrays["hi"], None, None, int(Status(header["status"])), validation, arrays["history"],
+        float(header["seconds"]),
+    )  # fmt: skip

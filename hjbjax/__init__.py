@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from hjbjax._names import *  # noqa: F403
     from hjbjax._names import __all__ as __all__
 
-LATER = ("filtering", "plotting", "zoo")  # imported on first use: a third of the import time of the package
+LATER = ("filtering", "neural", "plotting", "zoo")  # imported on first use: a third of the import time of the package
 
 
 def __getattr__(name: str) -> "Any":

@@ -53,7 +53,7 @@ from hjbjax.solvers.stationary import solve
 from hjbjax.tracing.interpreter import FallbackWarning
 
 if TYPE_CHECKING:
-    from hjbjax import filtering, plotting, zoo
+    from hjbjax import filtering, neural, plotting, zoo
 
 __all__ = [
     "Ball",
@@ -124,6 +124,7 @@ __all__ = [
     "load",
     "lyapunov_check",
     "march",
+    "neural",
     "perturbation_study",
     "plotting",
     "pontryagin",

@@ -66,6 +66,11 @@ class BlockSolution:
         return next((each for each in found if each is not Status.CONVERGED), Status.CONVERGED)
 
     @property
+    def ndim(self) -> int:
+        """The number of states n."""
+        return self._count(self.states)
+
+    @property
     def times(self) -> Any:
         """The kept times of a march; ``None`` for a stationary solution."""
         return self.parts[0].times

@@ -133,7 +133,7 @@ def pontryagin(
     # always float64: a residual of 1e-8 is below the rounding of float32
     with noting_interrupts(clock), own_settings(x64=True):
         try:
-            bvp = _pose(problem, start, horizon, terminal, guess.grid if isinstance(guess, Solution) else grid)
+            bvp = pose(problem, start, horizon, terminal, guess.grid if isinstance(guess, Solution) else grid)
             arguments.check_start(bvp)
             if bvp.closing is Closing.REST:
                 begun = [_to_rest(bvp, guess, rest, clock)]
@@ -167,7 +167,7 @@ def _guess_in_costs(guess: Solution | Extremal | None) -> Solution | Extremal | 
     return in_costs(guess) if isinstance(guess, Solution) else guess and with_payoff(guess, COST)
 
 
-def _pose(
+def pose(
     problem: Problem,
     start: np.ndarray,
     horizon: Number | FreeTime | None,

@@ -22,6 +22,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.posing import for_solvers
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
+from hjbjax.feedback.costate_feedback import costate_feedback
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.problem.grid import Grid
@@ -77,8 +78,19 @@ class GridFeedback(Protocol):
 
 
 def is_grid_feedback(feedback: object) -> "TypeIs[GridFeedback]":
-    """True for a Solution and other objects with ``control_at``, False for a plain function of the state."""
-    return hasattr(feedback, "control_at")
+    """True for a Solution and other objects with ``control_at`` on a grid, False for a plain function of the state."""
+    return hasattr(feedback, "control_at") and hasattr(feedback, "grid")
+
+
+def without_grid(feedback: Any, time_varying: bool) -> tuple[Any, bool]:
+    """A solution without a grid, such as a HopfSolution, as the function ``control_at``; True if this takes (t, x).
+
+    Other feedbacks are returned unchanged.
+    """
+    if not hasattr(feedback, "control_at") or hasattr(feedback, "grid"):
+        return feedback, time_varying
+    timed = getattr(feedback, "horizon", None) is not None or getattr(feedback, "times", None) is not None
+    return feedback.control_at, time_varying or timed
 
 
 def check_kept(solution: GridFeedback, duration: float, name: str) -> float:
@@ -232,7 +244,7 @@ class GreedyFeedback:
 
 
 @front_door
-def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
+def greedy_feedback(problem: Problem, solution: Any) -> Any:
     """A feedback that minimises the Hamiltonian at the state, with the slopes of the solution's value there.
 
     u(x) = argmin_u max_d [L + f·DV + ½ tr(σσᵀ D²V)], exact where ``solve`` minimises exactly, and always admissible.
@@ -250,7 +262,8 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
 
     Args:
       problem: the problem that was solved; it must have controls.
-      solution: the result of ``solve`` or ``march``.
+      solution: the result of ``solve`` or ``march``, or a solution without a grid, of ``hopf``, ``decompose`` or
+        ``neural``. Without a grid the problem must have one player, and noise that does not depend on the control.
 
     Returns:
       A function of the state, or of (t, x) if the solution was marched, with the keyword ``mode`` if there are modes.
@@ -270,6 +283,8 @@ def greedy_feedback(problem: Problem, solution: Solution) -> GreedyFeedback:
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"greedy_feedback: got {type(problem).__name__}, wanted a Problem")
+    if hasattr(solution, "costate_at") and not hasattr(solution, "grid"):
+        return costate_feedback(problem, solution)
     if not isinstance(solution, Solution):
         raise TypeError(f"greedy_feedback: got {type(solution).__name__}, wanted a Solution")
     names = () if problem.modes is None else problem.modes.names

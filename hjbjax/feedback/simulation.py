@@ -12,7 +12,7 @@ import numpy as np
 from hjbjax.discretisation.posing import over_checked_modes
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.discounting import with_integral, without_integral
-from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, is_grid_feedback, lookups
+from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, without_grid, is_grid_feedback, lookups
 from hjbjax.feedback.loop import Loop, check_shapes, noise_key, settled_loop, timeless
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
 from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon
@@ -75,8 +75,8 @@ def simulate(
 
     Args:
       problem: the system and its costs or rewards.
-      feedback: a Solution, a ``greedy_feedback``, or a function that returns the control, shape (m,). ``None`` if
-        there is no control.
+      feedback: a Solution, a ``greedy_feedback``, a solution without a grid, as of ``hopf`` and ``neural``, or a
+        function that returns the control, shape (m,). ``None`` if there is no control.
         With a Solution of a problem with a stopping cost, the path ends and pays ψ where stopping is optimal, that is
         where V = ψ at all surrounding nodes. Without a running cost and without noise it continues, and its cost is the
         cost of the best moment to stop.
@@ -132,6 +132,7 @@ def simulate(
         )
     if not isinstance(problem, Problem):
         raise TypeError(f"simulate: got {type(problem).__name__}, wanted a Problem, and then its feedback")
+    feedback, time_varying = without_grid(feedback, time_varying)
     problem, modes = costs_of(problem), problem.modes
     duration = float(arguments.positive(duration, "simulate: duration", "in units of time"))
     due = _due(feedback, duration)
@@ -292,6 +293,7 @@ def rollout(
       >>> jax.vmap(lambda key: rollout(walk, None, jnp.zeros(1), jnp.linspace(0, 1, 3), key=key))(keys).states.shape
       (4, 3, 1)
     """
+    feedback, time_varying = without_grid(feedback, time_varying)
     start = jnp.asarray(x0)
     if not jnp.issubdtype(start.dtype, jnp.floating):
         raise ValueError(f"rollout: x0 has dtype {start.dtype}, wanted floating point: the path follows it")

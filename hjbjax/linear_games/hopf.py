@@ -128,6 +128,11 @@ class HopfSolution:
     problem: Problem | None = None
 
     @property
+    def ndim(self) -> int:
+        """The number of states n."""
+        return self.game.terminal.dim
+
+    @property
     def bound(self) -> str | None:
         """ "lower" or "upper" if the formula is only this bound of V; ``None`` if it is V."""
         return None if self.game.exact else "upper" if self.game.negated else "lower"

@@ -23,7 +23,7 @@ from hjbjax.problem.types import Number, Scalar, State
 FLOOR = 0.01  # the least eigenvalue of the norm of the correction relative to the largest, in units of the box
 
 
-@pytree_dataclass()
+@pytree_dataclass(static=("quadratic",))
 class RestAnsatz:
     """The value near a rest point, with a network.
 
@@ -35,6 +35,7 @@ class RestAnsatz:
       matrix: P, shape (n, n).
       norm: the matrix of |y|², positive definite, shape (n, n).
       size: half the widths of the box, shape (n,).
+      quadratic: False leaves out P. The network, times the mean of |y|², is then all of V beyond the first order.
     """
 
     weights: Weights
@@ -44,13 +45,19 @@ class RestAnsatz:
     matrix: Any
     norm: Any
     size: Any
+    quadratic: bool = True
 
     def __call__(self, problem: Problem | None, t: Number, x: State) -> Scalar:
         """V at one state."""
         y = x - self.state
-        near = self.value + self.costate @ y + y @ (self.matrix @ y) / 2
-        shape = evaluate_network(self.weights, y / self.size) - evaluate_network(self.weights, jnp.zeros_like(y))
-        return jnp.asarray(near + (y @ (self.norm @ y)) * shape)
+        first, zero = self.value + self.costate @ y, jnp.zeros_like(y)
+        shape = evaluate_network(self.weights, y / self.size)
+        if self.quadratic:
+            beyond = shape - evaluate_network(self.weights, zero)
+            return jnp.asarray(first + y @ (self.matrix @ y) / 2 + (y @ (self.norm @ y)) * beyond)
+        at_rest, slope = jax.jvp(lambda z: evaluate_network(self.weights, z), (zero,), (y / self.size,))
+        scale = jnp.sum(jnp.diagonal(self.norm) * self.size**2) / 3
+        return jnp.asarray(first + scale * (shape - at_rest - slope))
 
 
 def norm_of(matrix: np.ndarray, size: np.ndarray) -> np.ndarray:

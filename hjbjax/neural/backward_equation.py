@@ -76,7 +76,7 @@ class Plant:
         """One Euler step: the next state, the cost, and the random part of the step."""
         drift = jnp.asarray(self.problem.drift(*self.problem.arguments(x, u, t=t)), x.dtype)
         random = jnp.asarray(self.problem.diffusion(x, u, None, t), x.dtype) @ dw
-        return x + drift * h + random, pointwise.running_cost(self.problem, t, x, u) * h, random
+        return jnp.asarray(x + drift * h + random), pointwise.running_cost(self.problem, t, x, u) * h, random
 
     @property
     def noises(self) -> int:
@@ -171,14 +171,16 @@ def _first_ansatz(plant: Plant, intervals: int, seed: int, layers: tuple[int, ..
             following, cost, _ = plant.move(k * h, h, x, plant.control(k * h, x, jnp.zeros_like(x)), dw)
             return following, (following, cost)
 
-        end, (states, costs) = jax.lax.scan(step, plant.start, (jnp.arange(intervals), dw))
+        _, (states, costs) = jax.lax.scan(step, plant.start, (jnp.arange(intervals), dw))
         paid = jax.vmap(lambda x: terminal_cost(plant.problem, plant.horizon, x))(states)
         return states, paid, jnp.sum(costs) + paid[-1]
 
     keys = jax.random.split(jax.random.key(seed), PILOT)
     states, paid, total = (np.asarray(each) for each in jax.jit(jax.vmap(path))(keys))
     if not (np.all(np.isfinite(states)) and np.all(np.isfinite(total))):
-        raise ValueError(f"{NAME}: paths under the cheapest control are not finite; check drift and noise, or raise intervals")
+        raise ValueError(
+            f"{NAME}: paths under the cheapest control are not finite; check drift and noise, or\nraise intervals"
+        )
     first = float(terminal_cost(plant.problem, plant.horizon, plant.start))
     size = np.sqrt(len(plant.start)) * np.std(states, axis=(0, 1))
     spread, difference = float(np.std(paid)), float(np.mean(total)) - first

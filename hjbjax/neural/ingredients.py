@@ -72,7 +72,7 @@ def state(value: object, label: str) -> np.ndarray:
     return array
 
 
-def box(lo: object, hi: object, name: str) -> tuple[np.ndarray, np.ndarray]:
+def corners(lo: object, hi: object, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The corners of a box, after checks."""
     low, high = state(lo, f"{name}: lo"), state(hi, f"{name}: hi")
     if low.shape != high.shape or np.any(low >= high):
@@ -94,4 +94,6 @@ def begun_layers(guess: object, inputs: int, layers: Sequence[int], name: str) -
         raise TypeError(f"{name}: got guess = {type(guess).__name__}, wanted a NeuralSolution")
     found = [np.shape(matrix)[0] for matrix, _ in weights]
     if found != [inputs, *layers]:
-        raise ValueError(f"{name}: the guess has layers {found[1:]} of {found[0]} inputs, wanted {list(layers)} of {inputs}")
+        raise ValueError(
+            f"{name}: the guess has layers {found[1:]} of {found[0]} inputs,\nwanted {list(layers)} of {inputs}"
+        )

@@ -4,6 +4,7 @@ Weights are a tuple of pairs (matrix, bias), one per layer, in NumPy until they 
 zero. An ansatz is then exactly its part without the network.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -23,7 +24,7 @@ def initial_weights(seed: int, inputs: int, layers: Sequence[int]) -> Weights:
     sizes = [inputs, *layers]
     hidden = [
         (draw.normal(size=(before, after)) / np.sqrt(before), np.zeros(after))
-        for before, after in zip(sizes, sizes[1:], strict=False)
+        for before, after in itertools.pairwise(sizes)
     ]
     return (*hidden, (np.zeros((sizes[-1], 1)), np.zeros(1)))
 

@@ -71,16 +71,21 @@ class NeuralSolution:
         return MESSAGES.get(self.status, self.status.message)
 
     @property
+    def ndim(self) -> int:
+        """The number of states n."""
+        return np.shape(self.lo)[-1]
+
+    @property
     def horizon(self) -> Any:
         """T, in units of time; ``None`` for a stationary value."""
         return self.ansatz.horizon if isinstance(self.ansatz, HorizonAnsatz) else None
 
-    def value_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
+    def value_at(self, *where: Numbers | Sequence, extrapolate: bool = False) -> Any:
         """V: ``value_at(x)``, or ``value_at(t, x)`` over a horizon.
 
         Args:
           where: states x, shape (n,) or (..., n); over a horizon preceded by times, a number or shape (...).
-          clamp: use the nearest point for states outside the box of the training; otherwise NaN.
+          extrapolate: evaluate the network also outside the box of the training; otherwise NaN there.
 
         Returns:
           Shape ``x.shape[:-1]``, in cost units.
@@ -88,25 +93,26 @@ class NeuralSolution:
         Raises:
           ValueError: states of the wrong length, or a missing time.
         """
-        return self._evaluate("value_at", where, clamp)
+        return self._evaluate("value_at", where, extrapolate)
 
-    def costate_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
+    def costate_at(self, *where: Numbers | Sequence, extrapolate: bool = False) -> Any:
         """DV, the exact gradient of ``value_at``, shape ``x.shape[:-1] + (n,)``; arguments as for ``value_at``."""
-        return self._evaluate("costate_at", where, clamp)
+        return self._evaluate("costate_at", where, extrapolate)
 
-    def control_at(self, *where: Numbers | Sequence, clamp: bool = True) -> Any:
+    def control_at(self, *where: Numbers | Sequence, extrapolate: bool = True) -> Any:
         """The control that minimises the Hamiltonian, shape ``x.shape[:-1] + (m,)``.
 
-        Outside the box of the training it is the control of the nearest point, unless ``clamp`` is False.
+        Paths from the box may leave it for a short time, so the network is also evaluated outside, unless
+        ``extrapolate`` is False.
 
         Raises:
           ValueError: the problem has no controls, or the solution was loaded without its problem.
         """
         if self.problem is None:
-            raise ValueError("NeuralSolution.control_at: the problem is missing; pass it: NeuralSolution.load(path, problem)")
+            raise ValueError("NeuralSolution.control_at: the problem is missing; use load(path, problem)")
         if self.problem.controls is None:
             raise ValueError("NeuralSolution.control_at: the problem has no controls")
-        return self._evaluate("control_at", where, clamp)
+        return self._evaluate("control_at", where, extrapolate)
 
     def __call__(self, *where: Numbers | Sequence) -> Any:
         """The control, as ``control_at``."""
@@ -126,14 +132,14 @@ class NeuralSolution:
         """
         if is_traced(self):
             raise ValueError("NeuralSolution.save: got a traced solution; save it outside of jit, vmap and grad")
-        fields = {name: each for name, each in vars(self.ansatz).items() if name != "weights"}
+        fields = {name: each for name, each in vars(self.ansatz).items() if name not in ("weights", "quadratic")}
         arrays = {name: np.asarray(each, float) for name, each in fields.items()}
         for i, (matrix, bias) in enumerate(self.ansatz.weights):
             arrays |= {f"matrix{i}": np.asarray(matrix, float), f"bias{i}": np.asarray(bias, float)}
         header = {
             "format": FORMAT, "version": VERSION, "ansatz": type(self.ansatz).__name__, "fields": list(fields),
             "layers": len(self.ansatz.weights), "status": int(self.code), "validation": self.validation or {},
-            "seconds": self.seconds,
+            "seconds": self.seconds, "quadratic": getattr(self.ansatz, "quadratic", True),
         }  # fmt: skip
         arrays |= {"lo": np.asarray(self.lo, float), "hi": np.asarray(self.hi, float)}
         history = np.zeros(0) if self.history is None else np.asarray(self.history, float)
@@ -154,9 +160,9 @@ class NeuralSolution:
         found = files.read(path, FORMAT, VERSION, _plan, _from_file)
         return found if problem is None else with_problem(found, problem)
 
-    def _evaluate(self, name: str, where: tuple, clamp: bool) -> Any:
+    def _evaluate(self, name: str, where: tuple, extrapolate: bool) -> Any:
         """One of the lookups at states (..., n)."""
-        timed, n = self.horizon is not None, np.shape(self.lo)[-1]
+        timed, n = self.horizon is not None, self.ndim
         if len(where) != 1 + timed:
             wanted = "(t, x): the value depends on time" if timed else "(x): the value does not depend on time"
             raise ValueError(f"NeuralSolution.{name}: got {len(where)} arguments, wanted {wanted}")
@@ -164,6 +170,8 @@ class NeuralSolution:
             raise ValueError(f"NeuralSolution.{name}: the terminal cost is missing; pass the problem to load")
         traced = is_traced(self, where)
         xp: Any = jnp if traced else np
+        t: Any
+        x: Any
         t, x = where if timed else (0.0, where[0])
         x = xp.asarray(x) if traced else np.asarray(x, float)
         if not x.shape or x.shape[-1] != n:
@@ -173,15 +181,15 @@ class NeuralSolution:
         shape = np.broadcast_shapes(t.shape, x.shape[:-1])
         t, x = xp.broadcast_to(t, shape).reshape(-1), xp.broadcast_to(x, (*shape, n)).reshape(-1, n)
         if traced:
-            found = _lanes(as_jax(self), name, clamp, t, x)
+            found: Any = _lanes(as_jax(self), name, extrapolate, t, x)
         else:
             with own_settings(x64=True):
-                found = _in_blocks(cast(self, np.float64), name, clamp, t, x)
+                found = _in_blocks(cast(self, np.float64), name, extrapolate, t, x)
         return found.reshape((*shape, *found.shape[1:]))
 
     def __repr__(self) -> str:
         over = "" if self.horizon is None or is_traced(self.horizon) else f" over {float(self.horizon):g}"
-        return f"NeuralSolution({self.status}, {np.shape(self.lo)[-1]} states{over})"
+        return f"NeuralSolution({self.status}, {self.ndim} states{over})"
 
     def __str__(self) -> str:
         lines = [f"{self.status}: {self.message}"]
@@ -194,29 +202,28 @@ def value_of(solution: NeuralSolution, t: Number, x: State) -> Scalar:
     return solution.ansatz(solution.problem, t, x)
 
 
-def _lanes(solution: NeuralSolution, name: str, clamp: bool, t: Array, x: Array) -> jax.Array:
+def _lanes(solution: NeuralSolution, name: str, extrapolate: bool, t: Array, x: Array) -> jax.Array:
     """A lookup at times (k,) and states (k, n)."""
     lo, hi = (jnp.asarray(corner, x.dtype) for corner in (solution.lo, solution.hi))
 
     def one(t: Number, x: State) -> jax.Array:
-        near = jnp.clip(x, lo, hi)
         if name == "value_at":
-            found = value_of(solution, t, near)
+            found = value_of(solution, t, x)
         else:
-            found = jax.grad(value_of, 2)(solution, t, near)
+            found = jax.grad(value_of, 2)(solution, t, x)
             if name == "control_at":
                 assert solution.problem is not None
                 assert solution.rule is not None
-                found = pointwise.minimiser(solution.problem, solution.rule, t, near, found)
-        return found if clamp else jnp.where(jnp.all(near == x), found, jnp.nan)
+                found = pointwise.minimiser(solution.problem, solution.rule, t, x, found)
+        return found if extrapolate else jnp.where(jnp.all((x >= lo) & (x <= hi)), found, jnp.nan)
 
     return jax.vmap(one)(t, x)
 
 
-_compiled = functools.partial(jax.jit, static_argnames=("name", "clamp"))(_lanes)
+_compiled = functools.partial(jax.jit, static_argnames=("name", "extrapolate"))(_lanes)
 
 
-def _in_blocks(solution: NeuralSolution, name: str, clamp: bool, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _in_blocks(solution: NeuralSolution, name: str, extrapolate: bool, t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The same in blocks of few different sizes, because each size is another program."""
     block = next((size for size in BLOCKS if size >= len(x)), BLOCKS[-1])
     parts = []
@@ -225,16 +232,17 @@ def _in_blocks(solution: NeuralSolution, name: str, clamp: bool, t: np.ndarray, 
         if not len(rows):
             raise ValueError(f"NeuralSolution.{name}: got no states")
         filled = np.resize(rows, block)
-        parts.append(np.asarray(_compiled(solution, name, clamp, t[filled], x[filled]))[: len(rows)])
+        parts.append(np.asarray(_compiled(solution, name, extrapolate, t[filled], x[filled]))[: len(rows)])
     return np.concatenate(parts)
 
 
 def with_problem(solution: NeuralSolution, problem: Problem) -> NeuralSolution:
     """The solution with the problem of its controls, after checks."""
-    n = np.shape(solution.lo)[-1]
-    checks.of_one_state(problem, n, "the number of states of the file")
-    problem = closures.settled(problem, n)
-    rule = None if problem.controls is None else pointwise.rule_of(problem, n)
+    n = solution.ndim
+    with own_settings(x64=True):
+        checks.of_one_state(problem, n, "the number of states of the file")
+        problem = closures.settled(problem, n)
+        rule = None if problem.controls is None else pointwise.rule_of(problem, n)
     return NeuralSolution(
         solution.ansatz, solution.lo, solution.hi, problem, rule, solution.code, solution.validation, solution.history,
         solution.seconds,
@@ -256,7 +264,8 @@ def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> NeuralSolution:
     if header["ansatz"] not in kinds:
         raise FileError(f"its ansatz {header['ansatz']!r} is not known here: update hjbjax")
     weights = tuple((arrays[f"matrix{i}"], arrays[f"bias{i}"]) for i in range(header["layers"]))
-    ansatz = kinds[header["ansatz"]](weights, **{name: arrays[name] for name in header["fields"]})
+    options: dict[str, Any] = {} if header["quadratic"] else {"quadratic": False}
+    ansatz = kinds[header["ansatz"]](weights, **{name: arrays[name] for name in header["fields"]}, **options)
     validation = {name: float(value) for name, value in header["validation"].items()}
     return NeuralSolution(
         ansatz, arrays["lo"], arrays["hi"], None, None, int(Status(header["status"])), validation, arrays["history"],

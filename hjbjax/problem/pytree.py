@@ -26,7 +26,7 @@ from hjbjax.problem.words import ELSEWHERE, WAYS
 P = ParamSpec("P")
 T = TypeVar("T")
 # the start of an error message of a function that other public functions call
-INNER = re.compile(r"^(lane \d+: )?(?:solve|solve_batch|march|reach_probability): ")
+INNER = re.compile(r"^(lane \d+: )?(?:solve|solve_batch|march|reach_probability|pontryagin): ")
 INTERRUPT = re.compile(r"\nKeyboardInterrupt\b.*\s*\Z")  # end of a traceback in the text of an XLA error
 REMEMBERED = 256  # the number of most recent answers to keep per function; their keys hold functions and arrays
 

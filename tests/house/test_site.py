@@ -39,7 +39,7 @@ def names_of(module):
     return [f"{module.__name__}.{name}" for name in names if not name.startswith("__")]
 
 
-MODULES = (hjb.zoo, hjb.filtering, hjb.plotting, hjb.geometry, hjb.chain, hjb.stability, hjb.convex)
+MODULES = (hjb.zoo, hjb.filtering, hjb.neural, hjb.plotting, hjb.geometry, hjb.chain, hjb.stability, hjb.convex)
 PUBLIC = [
     f"hjbjax.{name}" for name in hjb.__all__ if not name.startswith("__") and getattr(hjb, name) not in MODULES
 ] + [name for module in MODULES for name in names_of(module)]

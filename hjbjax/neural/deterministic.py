@@ -1,0 +1,322 @@
+"""``solve``: the value of a deterministic problem by a network, in more states than a grid holds.
+
+    βV − V_t = min_u [L + f·DV]
+
+The value contains the linear-quadratic solution exactly, see ``ansatz``. The loss has two parts. One is the mean square
+of the residual of the equation at random states, where the minimum over the controls is exact. The other compares V and
+DV with extremals of Pontryagin's principle. They begin at random states, and later where the residual is largest. This
+follows T. Nakamura-Zimmerer, Q. Gong and W. Kang, SIAM J. Sci. Comput. 43 (2021). The residual is relative to the sizes
+of the terms of the equation, so that units do not matter.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hjbjax.extremals import equilibria
+from hjbjax.extremals.indirect_method import pose
+from hjbjax.feedback.simulation import rollout
+from hjbjax.hamiltonian import pointwise
+from hjbjax.hamiltonian.pointwise import Rule
+from hjbjax.neural import ingredients
+from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz, norm_of, terminal_cost
+from hjbjax.neural.extremal_samples import ExtremalSamples
+from hjbjax.neural.network import checked_layers, initial_weights
+from hjbjax.neural.solution import NeuralSolution, value_of
+from hjbjax.neural.training import CHUNK, Training, train
+from hjbjax.problem import arguments
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import front_door, pytree_dataclass
+from hjbjax.problem.settings import own_settings
+from hjbjax.problem.types import Key, Number, State
+from hjbjax.solution.clock import CUT, Clock, noting_interrupts
+from hjbjax.solution.solution import SolveError
+from hjbjax.solution.status import Status
+
+NAME = "neural.solve"
+FLOOR = 0.01  # of the mean size of the terms: below it a residual counts relative to this size
+HELD_OUT, FRESH = 1024, 4096  # states that choose the best weights, and states of the final residual
+CANDIDATES = 64  # random states per extremal; the one with the largest residual is its start
+ROUNDS = 4  # in which the extremals are computed, the first one before the training
+POINTS = 128  # of extremals in a batch
+ENOUGH = 1e-8  # relative residual of a value that needs no training, such as the linear-quadratic one
+ROUGH = 1e-6  # tolerance of the extremals
+
+
+@pytree_dataclass(static=("rule",))
+class Equation:
+    """The equation on a box.
+
+    Args:
+      problem: the settled problem.
+      lo: lower corner.
+      hi: upper corner.
+      horizon: T; zero for a stationary problem.
+      floor: the least size of the terms, in cost per unit time.
+      rule: the method for the minimum of the Hamiltonian.
+    """
+
+    problem: Problem
+    lo: Any
+    hi: Any
+    horizon: Any
+    floor: Any
+    rule: Rule
+
+    def terms(self, ansatz: Callable, t: Number, x: State) -> tuple[jax.Array, jax.Array]:
+        """The residual V_t + min_u [L + f·DV] − βV, and the size of its terms, in cost per unit time."""
+        problem = self.problem
+        value, (rate, p) = jax.value_and_grad(ansatz, (1, 2))(problem, t, x)
+        # the control minimises H, so its own derivative contributes nothing
+        u = jax.lax.stop_gradient(pointwise.minimiser(problem, self.rule, t, x, jax.lax.stop_gradient(p)))
+        paid = pointwise.running_cost(problem, t, x, u)
+        moved = jnp.asarray(problem.drift(*problem.arguments(x, u, t=t)), p.dtype) @ p
+        parts = jnp.stack([rate, paid, moved, -problem.discount * value])
+        return jnp.sum(parts), jax.lax.stop_gradient(jnp.sum(jnp.abs(parts)) / 2)
+
+    def relative_residual(self, ansatz: Callable, t: Number, x: State) -> jax.Array:
+        """The residual relative to its terms."""
+        residual, size = self.terms(ansatz, t, x)
+        return residual / (size + self.floor)
+
+    def places(self, key: Key, count: int) -> tuple[jax.Array, jax.Array]:
+        """Random times (count,) and states (count, n)."""
+        of_time, of_state = jax.random.split(key)
+        states = jax.random.uniform(of_state, (count, np.shape(self.lo)[0]), minval=self.lo, maxval=self.hi)
+        return self.horizon * jax.random.uniform(of_time, (count,)), states
+
+
+@front_door
+def solve(
+    problem: Problem,
+    lo: State | Sequence[float],
+    hi: State | Sequence[float],
+    *,
+    seed: int,
+    horizon: float | None = None,
+    rest: State | Sequence[float] | None = None,
+    quadratic: bool = True,
+    extremals: int = 48,
+    held_out: int = 16,
+    steps: int = 3000,
+    batch: int = 256,
+    layers: Sequence[int] = (64, 64),
+    rate: float = 0.01,
+    tol: float = 0.02,
+    guess: NeuralSolution | None = None,
+    time_limit: float | None = None,
+    progress: bool | None = None,
+) -> NeuralSolution:
+    """Value and feedback of a deterministic problem on a box in about 5 to 20 states, by a network.
+
+    Args:
+      problem: deterministic, with one player, costs, controls in a ``Box`` or a ``Ball`` with finite bounds, and a rest
+        point inside the box or a horizon. The minimum over the controls must have a formula: drift and cost are sums of
+        quadratic polynomials of one control each.
+      lo: lower corner of the box, shape (n,).
+      hi: upper corner, shape (n,).
+
+    Keyword Args:
+      seed: of the weights and of all random states; the same seed gives the same result on the same machine.
+      horizon: T, in units of time; the value then depends on (t, x) and is the terminal cost at T. ``None``: infinite.
+      rest: a state near the rest point of an infinite horizon. ``None``: the origin.
+      quadratic: False leaves the linear-quadratic solution out of the value, for comparison.
+      extremals: number of extremals for the training; 0 trains on the residual of the equation only.
+      held_out: number of further extremals for the validation.
+      steps: steps of the optimiser.
+      batch: random states per step.
+      layers: widths of the hidden layers.
+      rate: the initial rate of Adam, which falls to zero over the steps.
+      tol: for CONVERGED, the errors of value and costs must be at most tol; without held-out extremals the residual.
+      guess: a NeuralSolution of the same problem and box, from whose weights the training starts.
+      time_limit: seconds, including compilation.
+      progress: show a bar of the steps after a second; ``None``: on a terminal.
+
+    Returns:
+      A NeuralSolution. Its ``validation`` has ``residual``, the root mean square of the relative residual at 4096 new
+      states; ``value_error`` and ``costate_error``, the relative L2 errors along held-out extremals; ``excess_cost``,
+      the mean relative excess of the costs of closed loops over the costs of these extremals; ``worst_excess``, the
+      largest; and ``failed``, the number of starts without an extremal.
+
+    Raises:
+      ValueError: an ingredient of the problem that is not supported, no rest point, or an argument that is not
+        admissible.
+      SolveError: Ctrl-C or the time limit before the training began.
+    """
+    corners = ingredients.corners(lo, hi, NAME)
+    counts = [arguments.count(each, f"{NAME}: {name}") for each, name in ((steps, "steps"), (batch, "batch"))]
+    for number, name in ((extremals, "extremals"), (held_out, "held_out")):
+        arguments.count(number, f"{NAME}: {name}", least=0)
+    arguments.positive(rate, f"{NAME}: rate")
+    arguments.positive(tol, f"{NAME}: tol")
+    widths, seed = checked_layers(layers, NAME), ingredients.known_seed(seed, NAME)
+    clock, draw, n = Clock(seconds=time_limit, progress=progress), np.random.default_rng(seed), len(corners[0])
+    with noting_interrupts(clock), own_settings(x64=True):
+        settled, rule = ingredients.settled_problem(problem, n, NAME, {"noise": "see deep_bsde"})
+        assert rule is not None
+        equation = Equation(settled, jnp.asarray(corners[0]), jnp.asarray(corners[1]), 0.0, 0.0, rule)
+        if horizon is None:
+            ansatz: Any
+            equation, ansatz = _at_rest(equation, rest, quadratic, initial_weights(seed, n, widths))
+            options: dict[str, Any] = {"rest": ansatz.state}
+        else:
+            duration = float(arguments.positive(horizon, f"{NAME}: horizon", "in units of time"))
+            equation, ansatz = _over_horizon(equation, duration, initial_weights(seed, n + 2, widths))
+            options = {"horizon": duration}
+        if guess is not None:
+            ingredients.begun_layers(guess, np.shape(ansatz.weights[0][0])[0], widths, NAME)
+            ansatz = dataclasses.replace(ansatz, weights=guess.ansatz.weights)
+        seen, unseen = (ExtremalSamples(*corners, count, options) for count in (extremals, held_out))
+        unseen.collect(settled, draw.uniform(*corners, (2 * held_out, n)), clock)
+        found = _trained(equation, ansatz, seen, counts, rate, seed, clock)
+        if found.status in CUT and not found.history:
+            raise SolveError(f"{NAME}: {found.status}, before the training began")
+        ansatz = jax.tree.map(np.asarray, dataclasses.replace(ansatz, weights=found.weights))
+        solution = NeuralSolution(ansatz, *corners, settled, rule)
+        validation = _validation(equation, solution, unseen, seed) | {"failed": float(seen.failed + unseen.failed)}
+        status = found.status
+        if status in (Status.MAX_STEPS, Status.CONVERGED):
+            judged = ("value_error", "excess_cost") if unseen.starts else ("residual",)
+            status = Status.CONVERGED if all(abs(validation[name]) <= tol for name in judged) else Status.MAX_STEPS
+        return dataclasses.replace(
+            solution, code=int(status), validation=validation, history=np.array(found.history), seconds=clock.elapsed()
+        )
+
+
+def _at_rest(equation: Equation, near: Any, quadratic: bool, weights: Any) -> tuple[Equation, RestAnsatz]:
+    """The equation with its floor, and the linear-quadratic solution at the rest point with a network."""
+    lo, hi = np.asarray(equation.lo), np.asarray(equation.hi)
+    near = np.zeros(len(lo)) if near is None else ingredients.state(near, f"{NAME}: rest")
+    rest, _ = equilibria.find(pose(equation.problem, hi, None, None, None), near, np.zeros(len(lo)))
+    state, matrix, size = np.asarray(rest.state), np.asarray(rest.matrix), (hi - lo) / 2
+    if np.any((state < lo) | (state > hi)):
+        raise ValueError(f"{NAME}: the rest point {state.tolist()} is outside the box; wanted it inside")
+    ansatz = RestAnsatz(
+        weights, state, np.asarray(rest.costate), np.asarray(rest.value), matrix, norm_of(matrix, size), size
+    )
+    equation = dataclasses.replace(equation, floor=FLOOR * _mean_size(equation, ansatz))
+    return equation, ansatz if quadratic else dataclasses.replace(ansatz, matrix=0 * matrix, quadratic=False)
+
+
+def _over_horizon(equation: Equation, horizon: float, weights: Any) -> tuple[Equation, HorizonAnsatz]:
+    """The equation with its horizon and floor, and the terminal cost with a network."""
+    equation = dataclasses.replace(equation, horizon=horizon)
+    lo, hi = np.asarray(equation.lo), np.asarray(equation.hi)
+    states = equation.places(jax.random.key(0), HELD_OUT)[1]
+    paid = np.asarray(jax.vmap(lambda x: terminal_cost(equation.problem, horizon, x))(states))
+    spread = float(np.std(paid)) or 1.0
+    ansatz = HorizonAnsatz(weights, horizon, (lo + hi) / 2, (hi - lo) / 2, float(np.mean(paid)), spread, spread, 0.0)
+    size = _mean_size(equation, ansatz)
+    equation = dataclasses.replace(equation, floor=FLOOR * size)
+    return equation, dataclasses.replace(ansatz, scale=horizon * float(size) or spread)
+
+
+def _mean_size(equation: Equation, ansatz: Any) -> jax.Array:
+    """The mean size of the terms of the equation for a value without a network."""
+    places = equation.places(jax.random.key(0), HELD_OUT)
+    return jnp.mean(jax.jit(jax.vmap(lambda t, x: equation.terms(ansatz, t, x)[1]))(*places))
+
+
+def _trained(
+    equation: Equation,
+    ansatz: Any,
+    seen: ExtremalSamples,
+    counts: Sequence[int],
+    rate: float,
+    seed: int,
+    clock: Clock,
+) -> Training:
+    """The training on the residual and on extremals, some of which are added on the way."""
+    steps, batch = counts
+    size = (equation.hi - equation.lo) / 2
+    values = jax.vmap(lambda t, x: ansatz(equation.problem, t, x))(*equation.places(jax.random.key(0), HELD_OUT))
+    least = jnp.maximum(FLOOR * jnp.mean(jnp.abs(values)), jnp.finfo(float).tiny)
+
+    def of(weights: Any) -> Any:
+        return dataclasses.replace(ansatz, weights=weights)
+
+    def squares(weights: Any, places: Any) -> jax.Array:
+        return jax.vmap(lambda t, x: equation.relative_residual(of(weights), t, x))(*places) ** 2
+
+    def misfit(weights: Any, t: Any, x: Any, value: Any, costate: Any) -> jax.Array:
+        found, p = jax.value_and_grad(of(weights), 2)(equation.problem, t, x)
+        scale = jnp.abs(value) + least
+        return ((found - value) / scale) ** 2 + jnp.mean(((p - costate) * size / scale) ** 2)
+
+    def loss(weights: Any, key: Key, data: Any) -> jax.Array:
+        of_states, of_points = jax.random.split(key)
+        rows = jax.random.randint(of_points, (POINTS,), 0, data["count"])
+        points = (data[name][rows] for name in ("times", "states", "values", "costates"))
+        apart = jax.vmap(lambda *point: misfit(weights, *point))(*points)
+        return jnp.mean(squares(weights, equation.places(of_states, batch))) + data["weight"] * jnp.mean(apart)
+
+    held_out = equation.places(jax.random.key(seed + 1), HELD_OUT)
+    measure = jax.jit(lambda weights: jnp.sqrt(jnp.mean(squares(weights, held_out))))
+    residuals = jax.jit(squares)
+    share, between = -(-seen.capacity // ROUNDS), max(1, -(-steps // CHUNK) // ROUNDS)
+
+    def refresh(weights: Any, number: int, data: Any) -> Any:
+        if number % between or number >= ROUNDS * between or not seen.capacity:
+            return data
+        places = equation.places(jax.random.key(seed + 2 + number), CANDIDATES * share)
+        worst = np.argmax(np.asarray(residuals(weights, places)).reshape(share, CANDIDATES), axis=1)
+        starts = np.asarray(places[1]).reshape(share, CANDIDATES, -1)[np.arange(share), worst]
+        seen.collect(equation.problem, starts, clock)
+        return seen.arrays()
+
+    return train(
+        loss, measure, ansatz.weights, seen.arrays(), steps=steps, rate=rate, seed=seed, clock=clock, enough=ENOUGH,
+        refresh=refresh,
+    )  # fmt: skip
+
+
+def _validation(equation: Equation, solution: NeuralSolution, unseen: ExtremalSamples, seed: int) -> dict[str, float]:
+    """Errors at states and along extremals that training has not seen."""
+    places = equation.places(jax.random.key(seed + 1_000_000), FRESH)
+
+    @jax.jit
+    def residuals(solution: NeuralSolution) -> jax.Array:
+        return jax.vmap(lambda t, x: equation.relative_residual(solution.ansatz, t, x))(*places)
+
+    found = {"residual": float(jnp.sqrt(jnp.mean(residuals(solution) ** 2)))}
+    if not unseen.starts:
+        return found
+    rows, size = slice(0, unseen.count), np.asarray(equation.hi - equation.lo)
+    values, slopes, states = unseen.values[rows], unseen.costates[rows] * size, unseen.states[rows]
+    where = (states,) if solution.horizon is None else (unseen.times[rows], states)
+    found["value_error"] = _relative(solution.value_at(*where, extrapolate=True) - values, values)
+    found["costate_error"] = _relative(solution.costate_at(*where, extrapolate=True) * size - slopes, slopes)
+    excess = closed_loop_costs(solution, np.stack(unseen.starts), unseen.longest) / np.array(unseen.costs) - 1
+    return found | {"excess_cost": float(np.mean(excess)), "worst_excess": float(np.max(excess))}
+
+
+def _relative(error: np.ndarray, exact: np.ndarray) -> float:
+    """The relative error in the root mean square."""
+    return float(np.sqrt(np.sum(error**2) / np.sum(exact**2)))
+
+
+def closed_loop_costs(solution: NeuralSolution, starts: np.ndarray, duration: float) -> np.ndarray:
+    """The costs of closed loops from some starts (k, n), shape (k,).
+
+    Args:
+      solution: the solution; a stationary one pays V at the end of a path, which is near the rest point.
+      starts: the states at time 0.
+      duration: the length of the paths; the horizon if there is one.
+    """
+
+    def cost(solution: NeuralSolution, start: State) -> jax.Array:
+        problem = solution.problem
+        assert problem is not None
+        timed = solution.horizon is not None
+        path = rollout(
+            problem, solution.control_at, start, jnp.asarray([0.0, duration]), max_step=duration, time_varying=timed,
+            due="terminal cost" if timed else "nothing",
+        )  # fmt: skip
+        left = 0.0 if timed else jnp.exp(-problem.discount * duration) * value_of(solution, 0.0, path.states[-1])
+        return path.cost + left
+
+    return np.asarray(jax.jit(jax.vmap(cost, (None, 0)))(solution, jnp.asarray(starts)))

@@ -1,0 +1,247 @@
+"""Networks: exact linear-quadratic values, stochastic values in closed form, files, feedbacks, limits and refusals."""
+
+import os
+import signal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import solve_continuous_are
+
+import hjbjax as hjb
+from hjbjax import neural
+from hjbjax.neural import backward_equation
+
+DRAW = np.random.default_rng(3)
+A, B = DRAW.normal(size=(3, 3)) / 2, DRAW.normal(size=(3, 2))
+PLANT = hjb.Problem(
+    lambda x, u: jnp.asarray(A) @ x + jnp.asarray(B) @ u, lambda x, u: x @ x + u @ u, hjb.Box([-99.0] * 2, [99.0] * 2)
+)
+CORNERS = [-1.0] * 3, [1.0] * 3
+RICCATI = solve_continuous_are(A, B, np.eye(3), np.eye(2))
+STATES = DRAW.uniform(-1, 1, (5, 3))
+CHEAP = {"layers": (8,), "extremals": 0, "held_out": 0, "steps": 25}
+
+
+@pytest.fixture(scope="module")
+def quadratic():
+    return neural.solve(PLANT, *CORNERS, seed=0, **CHEAP)
+
+
+def test_a_linear_quadratic_value_is_exact(quadratic):
+    assert quadratic.status is hjb.Status.CONVERGED
+    exact = np.einsum("ki,ij,kj->k", STATES, RICCATI, STATES)
+    assert np.allclose(quadratic.value_at(STATES), exact, rtol=1e-9)
+    assert np.allclose(quadratic.costate_at(STATES), 2 * STATES @ RICCATI, rtol=1e-9)
+    assert np.allclose(quadratic.control_at(STATES), -STATES @ RICCATI @ B, rtol=1e-9)
+    assert quadratic.validation["residual"] < 1e-9
+
+
+def test_it_is_a_feedback(quadratic):
+    path = hjb.simulate(PLANT, quadratic, STATES[0], 20.0)
+    assert abs(path.cost / quadratic.value_at(STATES[0]) - 1) < 1e-4
+    assert np.allclose(hjb.greedy_feedback(PLANT, quadratic)(STATES), quadratic(STATES), rtol=1e-9)
+    # another plant with the same value: half of the control has twice the effect
+    stronger = hjb.Problem(lambda x, u: PLANT.drift(x, 2 * u), lambda x, u: PLANT.cost(x, 2 * u), PLANT.controls)
+    assert np.allclose(2 * hjb.greedy_feedback(stronger, quadratic)(STATES), quadratic(STATES), rtol=1e-9)
+    slopes = jax.jit(jax.vmap(jax.grad(quadratic.value_at)))(jnp.asarray(STATES))
+    assert np.allclose(slopes, quadratic.costate_at(STATES), rtol=1e-4)
+
+
+def test_outside_the_box_only_the_control_is_known(quadratic):
+    assert np.isnan(quadratic.value_at([2.0, 0.0, 0.0]))
+    assert np.isfinite(quadratic.value_at([2.0, 0.0, 0.0], extrapolate=True))
+    assert np.all(np.isfinite(quadratic.control_at([2.0, 0.0, 0.0])))
+
+
+def test_a_file_brings_it_back(quadratic, tmp_path):
+    quadratic.save(tmp_path / "value")
+    back = neural.NeuralSolution.load(tmp_path / "value")
+    assert np.array_equal(back.value_at(STATES), quadratic.value_at(STATES))
+    assert back.validation == quadratic.validation
+    with pytest.raises(ValueError, match="the problem is missing"):
+        back.control_at(STATES)
+    again = neural.NeuralSolution.load(tmp_path / "value", PLANT)
+    assert np.array_equal(again.control_at(STATES), quadratic.control_at(STATES))
+
+
+def noisy(noise=0.5):
+    return hjb.Problem(
+        lambda x, u: u, lambda x, u: u @ u, hjb.Box([-np.inf] * 2, [np.inf] * 2), noise=noise,
+        terminal_cost=lambda x: x @ x,
+    )  # fmt: skip
+
+
+START = np.array([1.0, -0.5])
+STOCHASTIC = {"seed": 1, "intervals": 10, "steps": 100, "batch": 32, "layers": (16,), "rate": 0.02}
+
+
+@pytest.fixture(scope="module")
+def diffusion():
+    return neural.deep_bsde(noisy(), START, 1.0, **STOCHASTIC)
+
+
+def test_a_stochastic_value_in_closed_form(diffusion, tmp_path):
+    """P' = P² backwards from 1 gives P = 1/(1 + T − t), and V = P |x|² + σ² n log(1 + T − t)."""
+    exact = START @ START / 2 + 0.25 * 2 * np.log(2)
+    found = diffusion.validation
+    assert abs(found["value"] - exact) < 3 * found["standard_error"] + 2 * found["time_error"] + 0.01
+    assert found["unexplained"] < 0.1
+    assert abs(diffusion.value_at(0.0, START) - found["value"]) < 1e-9
+    x = np.array([0.3, -0.2])
+    assert abs(diffusion.value_at(1.0, x) - x @ x) < 1e-12
+    assert np.allclose(diffusion.control_at(0.5, x), -x / 1.5, atol=0.15)
+    diffusion.save(tmp_path / "value")
+    back = neural.NeuralSolution.load(tmp_path / "value", noisy())
+    assert np.array_equal(back.control_at(0.5, x), diffusion.control_at(0.5, x))
+
+
+def test_the_seed_repeats_it(diffusion):
+    again = neural.deep_bsde(noisy(), START, 1.0, **STOCHASTIC)
+    assert np.array_equal(again.history, diffusion.history)
+    assert again.validation == diffusion.validation
+
+
+@pytest.mark.slow
+def test_a_guess_continues(diffusion):
+    further = neural.deep_bsde(noisy(), START, 1.0, guess=diffusion, **STOCHASTIC | {"steps": 25})
+    assert abs(further.history[0] / min(diffusion.history) - 1) < 0.02  # the offset at the start has changed
+
+
+@pytest.mark.parametrize("method", ["fit", "deep_bsde"])
+def test_ctrl_c_keeps_the_best_weights(method, monkeypatch):
+    """A signal during the third step, as from a keyboard; a shell may start the tests with it ignored."""
+    calls = []
+
+    def interrupt(x):
+        calls.append(1)
+        if len(calls) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return x
+
+    def loss(p):
+        return jax.pure_callback(interrupt, jax.ShapeDtypeStruct((), np.float64), jax.lax.stop_gradient(p)) * 0 + p**2
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        if method == "fit":
+            found = hjb.fit(loss, 1.0, steps=50)
+            assert len(found.history) < 50
+            assert found.parameters < 1
+        else:
+            usual = backward_equation.train
+            monkeypatch.setattr(
+                backward_equation,
+                "train",
+                lambda loss, measure, *rest, **options: usual(
+                    loss, lambda weights: interrupt(measure(weights)), *rest, **options
+                ),
+            )
+            found = neural.deep_bsde(noisy(), START, 1.0, **STOCHASTIC)
+            assert len(found.history) == 3
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert found.status is hjb.Status.INTERRUPTED
+
+
+def test_a_time_limit(diffusion):
+    ended = neural.deep_bsde(noisy(), START, 1.0, time_limit=1e-9, **STOCHASTIC)
+    assert ended.status is hjb.Status.TIME_LIMIT
+    assert len(ended.history) == 1
+
+
+def test_what_is_not_supported_is_refused():
+    with pytest.raises(ValueError, match="with noise that does not depend on the control"):
+        neural.deep_bsde(noisy(noise=None), START, 1.0, seed=0)
+    quartic = hjb.Problem(lambda x, u: u, lambda x, u: jnp.sum(u**4), hjb.Box([-1.0] * 2, [1.0] * 2), noise=1.0)
+    with pytest.raises(ValueError, match="no formula"):
+        neural.deep_bsde(quartic, START, 1.0, seed=0)
+    with pytest.raises(ValueError, match="noise"):
+        neural.solve(noisy(), [-1.0] * 2, [1.0] * 2, seed=0)
+    target = hjb.Problem(lambda x, u: u, lambda x, u: u @ u, hjb.Box([-1.0], [1.0]), target=lambda x: x[0])
+    with pytest.raises(ValueError, match="target"):
+        neural.solve(target, [-1.0], [1.0], seed=0)
+    with pytest.raises(ValueError, match="lo must be smaller"):
+        neural.solve(PLANT, CORNERS[1], CORNERS[0], seed=0, **CHEAP)
+    with pytest.raises(ValueError, match="rest point"):
+        neural.solve(PLANT, [0.5] * 3, [1.0] * 3, seed=0, **CHEAP)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_a_hundred_states():
+    """V_t + ΔV − |∇V|² = 0 with ψ = log(½(1 + |x|²)): V(0, 0) = 4.59016, by E, Han and Jentzen (2017)."""
+    problem = hjb.Problem(
+        lambda x, u: 2 * u, lambda x, u: u @ u, hjb.Box([-np.inf] * 100, [np.inf] * 100), noise=np.sqrt(2.0),
+        terminal_cost=lambda x: jnp.log(0.5 * (1 + x @ x)),
+    )  # fmt: skip
+    found = neural.deep_bsde(problem, np.zeros(100), 1.0, seed=0)
+    assert found.status is hjb.Status.CONVERGED
+    assert abs(found.validation["value"] / 4.59016 - 1) < 0.005
+
+
+def relative(error, exact):
+    return np.linalg.norm(error) / np.linalg.norm(exact)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize(("quadratic", "within"), [(True, 1e-6), (False, 0.01)])
+def test_ten_states_with_and_without_the_linear_quadratic_part(quadratic, within):
+    draw = np.random.default_rng(0)
+    a, b = draw.normal(size=(10, 10)) / 4 - 0.5 * np.eye(10), draw.normal(size=(10, 3))
+    problem = hjb.Problem(
+        lambda x, u: jnp.asarray(a) @ x + jnp.asarray(b) @ u, lambda x, u: x @ x + u @ u,
+        hjb.Box([-500.0] * 3, [500.0] * 3),
+    )  # fmt: skip
+    found = neural.solve(problem, [-1.0] * 10, [1.0] * 10, seed=0, quadratic=quadratic, extremals=24, held_out=1)
+    states = draw.uniform(-1, 1, (1000, 10))
+    exact = np.einsum("ki,ij,kj->k", states, solve_continuous_are(a, b, np.eye(10), np.eye(3)), states)
+    assert relative(found.value_at(states) - exact, exact) < within
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_a_manufactured_value_in_six_states():
+    """The cost q(x) + |u|² with x' = f(x) + u has the value V if q = −f·DV + ¼ |DV|²."""
+    matrix = np.random.default_rng(3).normal(size=(6, 6)) / 2
+
+    def value(x):
+        return jnp.sum(jnp.log(1 + x**2)) + 0.5 * x @ x + 0.3 * (1 - jnp.cos(x @ jnp.asarray(matrix) @ x))
+
+    def free(x):
+        return -x + 0.5 * jnp.roll(x, 1) * jnp.cos(x)
+
+    def paid(x):
+        slope = jax.grad(value)(x)
+        return 0.25 * slope @ slope - free(x) @ slope
+
+    problem = hjb.Problem(lambda x, u: free(x) + u, lambda x, u: paid(x) + u @ u, hjb.Box([-50.0] * 6, [50.0] * 6))
+    found = neural.solve(problem, [-1.0] * 6, [1.0] * 6, seed=0)
+    states = np.random.default_rng(1).uniform(-1, 1, (2000, 6))
+    exact = np.asarray(jax.vmap(value)(states))
+    assert relative(found.value_at(states) - exact, exact) < 0.01
+    assert found.status is hjb.Status.CONVERGED
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_a_satellite_turns_as_cheaply_as_its_extremals():
+    """Attitude by Rodrigues parameters and rates; 100 held-out states."""
+    inertia = np.array([[4.0, 0.2, 0.1], [0.2, 3.0, 0.3], [0.1, 0.3, 2.0]])
+
+    def drift(x, u):
+        s, w = x[:3], x[3:]
+        turning = 0.25 * ((1 - s @ s) * w + 2 * jnp.cross(s, w) + 2 * s * (s @ w))
+        return jnp.concatenate([turning, jnp.linalg.solve(inertia, jnp.cross(jnp.asarray(inertia) @ w, w) + u)])
+
+    def cost(x, u):
+        return 2 * x[:3] @ x[:3] + 0.5 * x[3:] @ x[3:] + 0.5 * u @ u
+
+    problem = hjb.Problem(drift, cost, hjb.Box([-20.0] * 3, [20.0] * 3))
+    corner = np.array([0.8] * 3 + [1.0] * 3)
+    found = neural.solve(problem, -corner, corner, seed=0, held_out=100)
+    assert found.validation["failed"] <= 10
+    assert abs(found.validation["excess_cost"]) < 0.02
+    assert found.validation["worst_excess"] < 0.02

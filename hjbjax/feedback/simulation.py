@@ -12,7 +12,7 @@ import numpy as np
 from hjbjax.discretisation.posing import over_checked_modes
 from hjbjax.feedback.closed_loop import InitialValueProblem, Stepping, blank_record, integrate, integrate_part
 from hjbjax.feedback.discounting import with_integral, without_integral
-from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, without_grid, is_grid_feedback, lookups
+from hjbjax.feedback.feedback import ROUNDING, GridFeedback, check_kept, is_grid_feedback, lookups, without_grid
 from hjbjax.feedback.loop import Loop, check_shapes, noise_key, settled_loop, timeless
 from hjbjax.feedback.path import Interrupted, Path, PathStatus, truncate
 from hjbjax.feedback.payments import broken_promise, promise, surplus, value_at_horizon

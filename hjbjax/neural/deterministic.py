@@ -41,7 +41,8 @@ NAME = "neural.solve"
 FLOOR = 0.01  # of the mean size of the terms: below it a residual counts relative to this size
 HELD_OUT, FRESH = 1024, 4096  # states that choose the best weights, and states of the final residual
 CANDIDATES = 64  # random states per extremal; the one with the largest residual is its start
-ROUNDS = 4  # in which the extremals are computed, the first one before the training
+ROUNDS = 4  # in which the extremals are computed, half of them before the training
+WARM = 0.25  # of the steps, over which the weight of the residual grows from zero to one
 POINTS = 128  # of extremals in a batch
 ENOUGH = 1e-8  # relative residual of a value that needs no training, such as the linear-quadratic one
 ROUGH = 1e-6  # tolerance of the extremals
@@ -252,24 +253,30 @@ def _trained(
         rows = jax.random.randint(of_points, (POINTS,), 0, data["count"])
         points = (data[name][rows] for name in ("times", "states", "values", "costates"))
         apart = jax.vmap(lambda *point: misfit(weights, *point))(*points)
-        return jnp.mean(squares(weights, equation.places(of_states, batch))) + data["weight"] * jnp.mean(apart)
+        residual = jnp.mean(squares(weights, equation.places(of_states, batch)))
+        return data["share"] * residual + data["weight"] * jnp.mean(apart)
 
     held_out = equation.places(jax.random.key(seed + 1), HELD_OUT)
     measure = jax.jit(lambda weights: jnp.sqrt(jnp.mean(squares(weights, held_out))))
     residuals = jax.jit(squares)
-    share, between = -(-seen.capacity // ROUNDS), max(1, -(-steps // CHUNK) // ROUNDS)
+    chunks = -(-steps // CHUNK)
+    rounds = {chunks * k // ROUNDS: -(-seen.capacity // (2 * (ROUNDS - 1))) for k in range(1, ROUNDS)}
+    rounds[0] = seen.capacity // 2 + seen.capacity % 2
 
     def refresh(weights: Any, number: int, data: Any) -> Any:
-        if number % between or number >= ROUNDS * between or not seen.capacity:
-            return data
-        places = equation.places(jax.random.key(seed + 2 + number), CANDIDATES * share)
-        worst = np.argmax(np.asarray(residuals(weights, places)).reshape(share, CANDIDATES), axis=1)
-        starts = np.asarray(places[1]).reshape(share, CANDIDATES, -1)[np.arange(share), worst]
-        seen.collect(equation.problem, starts, clock)
-        return seen.arrays()
+        if (share := rounds.get(number, 0)) and len(seen.starts) < seen.capacity:
+            places = equation.places(jax.random.key(seed + 2 + number), CANDIDATES * share)
+            worst = np.argmax(np.asarray(residuals(weights, places)).reshape(share, CANDIDATES), axis=1)
+            starts = np.asarray(places[1]).reshape(share, CANDIDATES, -1)[np.arange(share), worst]
+            seen.collect(equation.problem, starts, clock)
+            data = seen.arrays()
+        # the equation has other solutions, also negative ones; begin with the extremals, which are near the value
+        weight = min(1.0, number / (WARM * chunks)) if seen.count else 1.0
+        return data | {"share": jnp.asarray(weight)}
 
+    begun = seen.arrays() | {"share": jnp.asarray(1.0)}
     return train(
-        loss, measure, ansatz.weights, seen.arrays(), steps=steps, rate=rate, seed=seed, clock=clock, enough=ENOUGH,
+        loss, measure, ansatz.weights, begun, steps=steps, rate=rate, seed=seed, clock=clock, enough=ENOUGH,
         refresh=refresh,
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from hjbjax.calibration.trajectories import fit_trajectories
 from hjbjax.decomposition.combination import BlockSolution
 from hjbjax.decomposition.decompose import Decomposition, decompose
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
+from hjbjax.enclosure.enclose import Enclosure, enclose
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
 from hjbjax.feedback.feedback import greedy_feedback
@@ -63,6 +64,7 @@ __all__ = [
     "Decomposition",
     "Direct",
     "Dirichlet",
+    "Enclosure",
     "Eno2",
     "Equilibrium",
     "Explicit",
@@ -107,6 +109,7 @@ __all__ = [
     "design",
     "discount_rate",
     "dissipation",
+    "enclose",
     "equilibrium",
     "estimate",
     "expected_exit_time",

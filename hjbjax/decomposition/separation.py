@@ -186,6 +186,9 @@ class _Algebra:
         number = operation(*(_number(each, dtype) for each in (left, right)))
         return Separated(ONE, {left.inputs | right.inputs: number})
 
+    def computes(self, eqn: jex.JaxprEqn) -> bool:
+        return False
+
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
         return None
 

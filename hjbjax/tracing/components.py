@@ -100,6 +100,9 @@ class _Arrays:
     def combine(self, operation: Callable, dtype: np.dtype, left: Numbers, right: Numbers) -> jax.Array:
         return operation(*jnp.broadcast_arrays(jnp.asarray(left, dtype), jnp.asarray(right, dtype)))
 
+    def computes(self, eqn: jex.JaxprEqn) -> bool:
+        return False
+
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> list | None:
         return stacks.results(eqn, operands)
 

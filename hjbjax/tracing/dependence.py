@@ -245,6 +245,9 @@ class _Polynomials:
             return _product(left, right)
         return _some_function([left, right])
 
+    def computes(self, eqn: jex.JaxprEqn) -> bool:
+        return False
+
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
         return None  # sets of terms are stored per entry, and are cheap
 

@@ -58,6 +58,9 @@ class Algebra(Protocol):
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
         """Results of a function with a custom derivative rule."""
 
+    def computes(self, eqn: jex.JaxprEqn) -> bool:
+        """True if the rules also apply to numbers that hold at all nodes, which JAX would round."""
+
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> list | None:
         """Results of an equation on vectors too long for components; None if the component rules apply."""
 
@@ -105,7 +108,7 @@ def evaluate_jaxpr(closed: jex.ClosedJaxpr, arguments: Sequence[Operand], algebr
 def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
     """Results of one equation by the first rule that applies."""
     name = host_functions.NAME if host_functions.is_host_call(eqn) else eqn.primitive.name
-    if not any(map(varies, operands)):
+    if not any(map(varies, operands)) and not algebra.computes(eqn):
         return _bind_uniform(eqn, operands)
     if name in CALLS and CALLS[name] in eqn.params:
         inner = eqn.params[CALLS[name]]  # some calls keep a jaxpr without constants

@@ -1,0 +1,73 @@
+"""Corrections of a candidate W by the defects that paths meet on their way.
+
+Let E solve (β − L^π) E = β s, where L^π is the generator of the Markov chain under a policy π: the discounted mean of s
+along the path from each node. Subtracting E from W lowers the defect β W − H by about β s. Two uses:
+
+- s is the middle of the range of the defect in each cell: defect correction, which removes most of the discretisation
+  error of the node values.
+- s is the part of the defect above a level, widened and smoothed: the shift of the bound falls to that level, while the
+  bound becomes wider only where paths meet large defects.
+
+Nothing here needs to be exact: the defects of the corrected candidate are bounded again.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hjbjax.markov_chain import chain
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import altered
+
+REACH = 2  # cells by which a source is widened, and then smoothed, so that its E is smooth on the grid
+MARGIN = 1.3  # a source is larger than the defect, because the chain spreads it
+DIRECT = 2  # states up to which the linear equations are factored
+
+
+def on_nodes(cells: np.ndarray, grid: Grid) -> np.ndarray:
+    """Numbers per cell as numbers per node; a periodic axis has one more cell than nodes."""
+    for axis, cyclic in enumerate(grid.periodic):
+        if cyclic:
+            ends = np.take(cells, [0, -1], axis=axis).mean(axis=axis, keepdims=True)
+            middle = np.delete(cells, [0, cells.shape[axis] - 1], axis=axis)
+            cells = np.concatenate([ends, middle], axis=axis)
+    return cells
+
+
+def solver(
+    problem: Problem, grid: Grid, policy: np.ndarray | None, rate: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The solution E of (β − L^π) E = β s as a function of s.
+
+    Args:
+      problem: the problem.
+      grid: the grid.
+      policy: the control at every node, shape (*grid, m); ``None`` without controls.
+      rate: β at every node, shape (*grid).
+    """
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import bicgstab, splu
+
+    without = altered(problem, discount=1.0) if callable(problem.discount) else problem
+    matrix = (diags_array(rate.ravel()) - chain.generator(without, grid, policy)).tocsc()
+    if grid.ndim <= DIRECT:
+        factors = splu(matrix)
+        return lambda source: factors.solve((rate * source).ravel()).reshape(grid.shape)
+    scale = diags_array(1 / matrix.diagonal())
+
+    def solve(source: np.ndarray) -> np.ndarray:
+        found, _ = bicgstab(matrix, (rate * source).ravel(), rtol=1e-6, maxiter=500, M=scale)
+        return found.reshape(grid.shape)
+
+    return solve
+
+
+def widened(excess: np.ndarray, grid: Grid) -> np.ndarray:
+    """A smooth source that is nowhere smaller than the excess: the mean over neighbours of the largest neighbour."""
+    from scipy.ndimage import maximum_filter1d, uniform_filter1d
+
+    for axis, cyclic in enumerate(grid.periodic):
+        mode, size = "wrap" if cyclic else "nearest", 2 * REACH + 1
+        excess = uniform_filter1d(maximum_filter1d(excess, size, axis, mode=mode), size, axis, mode=mode)
+    return MARGIN * excess

@@ -1,0 +1,377 @@
+"""``enclose``: two functions between which the value of the continuous problem lies, with proof."""
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.enclosure import correction, defect
+from hjbjax.enclosure.defect import Defects
+from hjbjax.enclosure.interpolant import AxisTable, Spline, axis_table
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import REWARD
+from hjbjax.problem.problem import Problem, is_constrained, is_discounted, is_random
+from hjbjax.problem.pytree import front_door, is_traced
+from hjbjax.problem.rewards import costs_of
+from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import in_unit_box
+from hjbjax.problem.types import Numbers
+from hjbjax.solution.rewards import in_costs
+from hjbjax.solution.solution import Solution
+from hjbjax.solution.status import Status
+from hjbjax.solvers import memory
+from hjbjax.tracing import closures
+from hjbjax.tracing.intervals import point
+from hjbjax.tracing.operations import operations
+from hjbjax.tracing.taylor_forms import traced
+
+SMOOTHING = 3  # defect corrections before the bounds part
+WIDENED = 3.0  # the level of a correction is the largest defect divided by this number
+FALLS = 0.7  # a defect correction must reduce the mean defect to this fraction
+STAGNANT = 2  # corrections without progress after which a bound is given up
+BISECTIONS = 2  # of the cells with the largest defects
+LARGEST = 0.5  # fraction of the largest defect from which on a cell is bisected
+GAIN = 0.97  # a correction that leaves more than this fraction of the width is no progress
+
+
+@front_door
+def enclose(
+    problem: Problem,
+    solution: Solution,
+    *,
+    tol: float = 1e-3,
+    rounds: int = 8,
+    max_memory: int | None = None,
+) -> "Enclosure":
+    """Bounds on the value of the continuous problem, with proof: neither the grid nor rounding is neglected.
+
+    A spline W near the solution has the defect β W − H(x, DW). If it is at most β k everywhere, V ≥ W − k; if it is at
+    least −β k, V ≤ W + k. The defect is bounded over whole cells by interval arithmetic with outward rounding. Then W
+    is corrected where its defect is large, separately for both bounds, and checked again.
+
+    The bounds are those of the problem with the ends of its grid: projected ends are walls that stop outward motion.
+
+    Args:
+      problem: one player, a discount, no noise, jumps, modes, targets or obstacles. Drift, cost and discount must be
+        Lipschitz functions of the state that are defined on the whole box. On a periodic axis they must be periodic.
+      solution: a solution of this problem by ``solve``. The bounds hold for any solution; they are narrow for a good
+        one.
+
+    Keyword Args:
+      tol: the wanted mean width, relative to the range of V.
+      rounds: the largest number of corrections per bound.
+      max_memory: the number of bytes that count as free.
+
+    Returns:
+      An Enclosure.
+
+    Raises:
+      ValueError: the problem has an ingredient for which there is no proof, or a function without an interval rule.
+      MemoryError: the estimated memory is not free.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-2.0], [2.0]), discount=1.0)
+      >>> found = hjb.enclose(problem, hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,))))
+      >>> exact = (5**0.5 - 1) / 2 * 0.5**2  # the Riccati equation
+      >>> bool(found.lower_at([0.5]) <= exact <= found.upper_at([0.5]))
+      True
+    """
+    start = time.perf_counter()
+    own, value, grid = _checked(problem, solution)
+    arguments.positive(tol, "enclose: tol")
+    count = arguments.count(rounds, "enclose: rounds")
+    needed = memory.fitting(peak_bytes(own, grid), grid, max_memory)
+    scale = float(np.ptp(value)) or 1.0
+    with own_settings(x64=True):
+        task = _Task(own, grid, tuple(axis_table(grid, axis) for axis in range(grid.ndim)), scale * tol)
+        middle, found = task.corrected(value)
+        lower = task.bound(middle, found, 1, count)
+        upper = task.bound(middle, found, -1, count)
+    if problem.payoff == REWARD:
+        lower, upper = upper.negative(), lower.negative()
+    nodes = grid.nodes().reshape(-1, grid.ndim)
+    low, high = (each.at(nodes).reshape(grid.shape) for each in (lower, upper))
+    share = float(np.mean(high - low)) / scale
+    stats = {"seconds": time.perf_counter() - start, "bytes": needed, "corrections": len(lower.shifts + upper.shifts)}
+    status = Status.CONVERGED if share <= tol else Status.MAX_STEPS
+    return Enclosure(solution.grid, low, high, status, _message(solution.grid, share, tol), stats, (lower, upper))
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """One bound: the best of several shifted splines.
+
+    Attributes:
+      tables: the cells along every axis.
+      coefficients: of every spline, each (*grid).
+      shifts: the numbers that are subtracted from a lower bound, or added to an upper bound.
+      sign: 1 for a lower and −1 for an upper bound.
+    """
+
+    tables: tuple[AxisTable, ...]
+    coefficients: tuple[np.ndarray, ...]
+    shifts: tuple[float, ...]
+    sign: int
+
+    def at(self, states: np.ndarray) -> np.ndarray:
+        """The bound at states (count, n) inside the box, rounded to its side."""
+        best = np.full(len(states), -self.sign * np.inf)
+        for values, shift in zip(self.coefficients, self.shifts, strict=True):
+            found = Spline(self.tables, values).at(states)
+            if self.sign > 0:
+                best = np.maximum(best, (found - point(shift)).lo)
+            else:
+                best = np.minimum(best, (found + point(shift)).hi)
+        return best
+
+    def negative(self) -> "Bound":
+        """Minus the bound, which is a bound from the other side."""
+        return Bound(self.tables, tuple(-each for each in self.coefficients), self.shifts, -self.sign)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Enclosure:
+    """Two functions between which the value of the continuous problem lies; made by ``enclose``.
+
+    Args:
+      grid: the grid.
+      lower: the lower bound at the nodes, shape (*grid), in cost units.
+      upper: the upper bound at the nodes.
+      status: CONVERGED if the mean width is at most ``tol`` times the range of V, otherwise MAX_STEPS. The bounds hold
+        in both cases.
+      message: the problem that the bounds refer to, and their mean width.
+      stats: "seconds", "bytes" (the estimated memory) and "corrections".
+      bounds: the lower and the upper bound as functions.
+    """
+
+    grid: Grid
+    lower: np.ndarray
+    upper: np.ndarray
+    status: Status
+    message: str
+    stats: dict
+    bounds: tuple[Bound, Bound] = dataclasses.field(repr=False)
+
+    @property
+    def width(self) -> np.ndarray:
+        """The upper minus the lower bound at the nodes, shape (*grid)."""
+        return self.upper - self.lower
+
+    def lower_at(self, x: Numbers | Sequence) -> Any:
+        """The lower bound between the nodes.
+
+        Args:
+          x: states, shape (n,) or (..., n).
+
+        Returns:
+          Shape (...), in cost units; NaN outside the box.
+        """
+        return self._at("lower_at", 0, x)
+
+    def upper_at(self, x: Numbers | Sequence) -> Any:
+        """The upper bound between the nodes; see ``lower_at``."""
+        return self._at("upper_at", 1, x)
+
+    def _at(self, name: str, side: int, x: Numbers | Sequence) -> Any:
+        states, n = np.asarray(x, float), self.grid.ndim
+        if states.ndim == 0 or states.shape[-1] != n:
+            raise ValueError(f"Enclosure.{name}: got states of shape {states.shape}, wanted (..., {n})")
+        flat = states.reshape(-1, n)
+        lo, hi = np.asarray(self.grid.lo, float), np.asarray(self.grid.hi, float)
+        cyclic = np.array(self.grid.periodic)
+        flat = np.where(cyclic & ((flat < lo) | (flat > hi)), lo + np.mod(flat - lo, hi - lo), flat)
+        inside = np.all((flat >= lo) & (flat <= hi), axis=-1)
+        found = np.full(len(flat), np.nan)
+        if np.any(inside):
+            found[inside] = self.bounds[side].at(flat[inside])
+        return found.reshape(states.shape[:-1])
+
+    def __repr__(self) -> str:
+        return f"Enclosure({self.status}, largest width {np.max(self.width):.3g} on {self.grid.size} nodes)"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """The data of both bounds.
+
+    Attributes:
+      problem: a problem of one player with costs.
+      grid: the grid.
+      tables: the cells along every axis.
+      wanted: the width at which corrections stop, in cost units.
+    """
+
+    problem: Problem
+    grid: Grid
+    tables: tuple[AxisTable, ...]
+    wanted: float
+
+    def defects(self, values: np.ndarray) -> Defects:
+        """The defects of the spline with these coefficients."""
+        return defect.defects(self.problem, self.grid, Spline(self.tables, values))
+
+    def move(self, found: Defects, source: np.ndarray) -> np.ndarray:
+        """The correction of the coefficients by a source at the nodes."""
+        policy = np.stack(
+            [correction.on_nodes(found.policy[..., j], self.grid) for j in range(found.policy.shape[-1])], axis=-1
+        ) if found.policy.shape[-1] else None  # fmt: skip
+        return correction.solver(self.problem, self.grid, policy, self.rates())(source)
+
+    def rates(self) -> np.ndarray:
+        """The discount at the nodes."""
+        discount = self.problem.discount
+        if not callable(discount):
+            return np.full(self.grid.shape, float(discount))
+        nodes = self.grid.nodes().reshape(-1, self.grid.ndim)
+        return np.asarray(jax.vmap(discount)(nodes)).reshape(self.grid.shape)
+
+    def corrected(self, values: np.ndarray) -> tuple[np.ndarray, Defects]:
+        """The coefficients after defect corrections, as long as the mean defect falls, and their defects."""
+        found = self.defects(values)
+        for _ in range(SMOOTHING):
+            middle = (found.low + found.high) / 2
+            if not np.all(np.isfinite(middle)):
+                break
+            changed = values - self.move(found, correction.on_nodes(middle, self.grid))
+            after = self.defects(changed)
+            if not np.mean(np.abs(after.low + after.high)) < FALLS * np.mean(np.abs(2 * middle)):
+                break
+            values, found = changed, after
+        return values, found
+
+    def bound(self, values: np.ndarray, found: Defects, sign: int, rounds: int) -> Bound:
+        """The best bound after corrections.
+
+        Raises:
+          ValueError: no bound is finite.
+        """
+        kept: list[tuple[np.ndarray, float]] = []
+        best, stagnant = np.full(self.grid.shape, -np.inf), 0
+        for _ in range(rounds):
+            found = self.bisected(values, found, sign)
+            sizes = found.high if sign > 0 else -found.low
+            shift = float(np.max(sizes))
+            if not np.isfinite(shift):
+                break
+            before = np.mean(best)
+            better = sign * values - shift > best
+            best = np.maximum(best, sign * values - shift)
+            if np.any(better):
+                kept.append((values, shift))
+            # progress is measured by the part of the width that one more correction may win
+            gain = np.mean(best) - before
+            stagnant = 0 if gain > (1 - GAIN) * max(shift, self.wanted) else stagnant + 1
+            if shift <= self.wanted / 4 or stagnant >= STAGNANT:
+                break
+            excess = correction.on_nodes(np.maximum(sizes - shift / WIDENED, 0), self.grid)
+            values, found = self.better(values, found, excess, sign)
+        if not kept:
+            raise ValueError(_no_bound(self.grid, found, sign))
+        return Bound(self.tables, tuple(each for each, _ in kept), tuple(shift for _, shift in kept), sign)
+
+    def better(self, values: np.ndarray, found: Defects, excess: np.ndarray, sign: int) -> tuple[np.ndarray, Defects]:
+        """The better of two corrections for an excess at the nodes, and its defects.
+
+        One follows the paths. The other is a bump at the nodes themselves: at a kink that paths leave, the spline has
+        an extremum, where the motion does not count and W must be the value of resting there.
+        """
+        moves = [self.move(found, correction.widened(excess, self.grid)), excess]
+        options = [values - sign * move for move in moves]
+        after = [self.defects(each) for each in options]
+
+        def bound(option: np.ndarray, found: Defects) -> float:
+            return float(np.mean(sign * option) - np.max(found.high if sign > 0 else -found.low))
+
+        return max(zip(options, after, strict=True), key=lambda pair: bound(*pair))
+
+    def bisected(self, values: np.ndarray, found: Defects, sign: int) -> Defects:
+        """The defects with the cells of the largest ones cut into parts, at most one in ten."""
+        for depth in range(1, BISECTIONS + 1):
+            sizes = found.high if sign > 0 else -found.low
+            if not np.all(np.isfinite(sizes)):
+                break
+            level = max(LARGEST * np.max(sizes), np.quantile(sizes, 0.9))
+            chosen = sizes >= level
+            # where the range of the defect is narrow, its largest value is already known
+            chosen &= found.high - found.low > 0.2 * np.abs(sizes)
+            if not np.any(chosen):
+                break
+            found = defect.refine(self.problem, self.grid, Spline(self.tables, values), found, chosen, depth)
+        return found
+
+
+def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray, Grid]:
+    """The problem with costs and its numbers settled, the value as a cost, and the grid.
+
+    Raises:
+      ValueError: there is no proof for the problem, its grid or its solution.
+    """
+    for given, kind in ((problem, Problem), (solution, Solution)):
+        if not isinstance(given, kind):
+            raise TypeError(f"enclose: got {type(given).__name__}, wanted a {kind.__name__}")
+    if is_traced(problem, solution.value):
+        raise ValueError("enclose: got traced numbers; call it outside of jit, vmap and grad")
+    grid, costs = solution.grid, in_costs(solution)
+    lacking = {
+        "a game": problem.is_game, "random paths (noise, jumps or modes)": is_random(problem),
+        "modes": problem.modes is not None, "pushes": bool(problem.pushes), "growth": problem.growth is not None,
+        "a target": problem.target is not None, "time_dependent=True": problem.time_dependent,
+        "a stopping_cost, a stopping_reward or a running_max": is_constrained(problem)
+        or problem.stopping_reward is not None,
+        "no discount": not is_discounted(problem), "a marched solution": solution.times is not None,
+    }  # fmt: skip
+    if found := [name for name, there in lacking.items() if there]:
+        raise ValueError(
+            f"enclose: got {' and '.join(found)}; wanted a stationary problem of one player with a discount, whose\n"
+            "paths are not random and do not end. Bounds on the true value are proved only for these problems;\n"
+            "Solution.grid_error and box_error are estimates for the others"
+        )
+    kinds = sorted({kind for pair in grid.edges if pair for kind in pair if kind != "projected"})
+    if kinds:
+        raise ValueError(
+            f"enclose: got {' and '.join(kinds)} ends; wanted projected ends or periodic axes. Solve on a larger box\n"
+            "with edges='projected': the bounds are those of the problem with walls at its ends"
+        )
+    value = np.asarray(costs.value, float)
+    if value.shape != grid.shape or not np.all(np.isfinite(value)):
+        raise ValueError(f"enclose: got a value of shape {value.shape} with numbers that are not finite, or a batch")
+    known = in_unit_box(closures.settled(costs_of(problem), grid.ndim), grid.ndim)
+    return known, value, grid
+
+
+def peak_bytes(problem: Problem, grid: Grid) -> int:
+    """Bytes that ``enclose`` uses at its peak: all scalars of one block of cells, and the factors of the chain."""
+    n, m = grid.ndim, 0 if problem.controls is None else problem.controls.dim
+    arguments = ([0.0] * n, [0.0] * m)
+    counts = [operations(traced(each, *arguments)) for each in (problem.drift, problem.cost) if each is not None]
+    scalars = 60 + sum(each.single + each.whole for each in counts)
+    # range, centre, slopes, gradient and second derivatives, each with two bounds
+    block = 8 * min(grid.size, defect.BLOCK) * 2 * (2 + 2 * n + n * (n + 1) // 2) * scalars
+    fill = 31 * np.log2(grid.size + 2) if n <= correction.DIRECT else 20
+    return int(block + grid.size * (12 * fill + 8 * 30))
+
+
+def _message(grid: Grid, share: float, tol: float) -> str:
+    """The statement that is proved, and its width."""
+    walls = bool(grid.sides("projected"))
+    which = "the problem with walls at the projected ends of the box" if walls else "the continuous problem"
+    end = "" if share <= tol else f", above tol = {tol:g}: use more nodes, or a better solution"
+    return f"The value of {which} lies between the bounds; their mean width is {share:.2g} of the range of V{end}."
+
+
+def _no_bound(grid: Grid, found: Defects, sign: int) -> str:
+    """The message for a defect that is not bounded, with the first such cell."""
+    sizes = found.high if sign > 0 else -found.low
+    index = np.unravel_index(int(np.argmax(~np.isfinite(sizes))), sizes.shape)
+    nodes = [np.append(np.asarray(grid.axis(k)), grid.hi[k]) for k in range(grid.ndim)]
+    state = [float(nodes[k][i]) for k, i in enumerate(index)]
+    return (
+        f"enclose: the {'lower' if sign > 0 else 'upper'} bound is infinite: drift, cost or 1/discount is not bounded\n"
+        f"in the cell at x = {np.round(state, 4).tolist()}. Functions must be finite and Lipschitz on the whole box,\n"
+        "and controls bounded unless the cost is quadratic in them"
+    )

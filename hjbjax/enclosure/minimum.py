@@ -1,0 +1,366 @@
+"""The Hamiltonian over cells: H(x, p) = min over u of G(x, u) = L + f·p, with proof.
+
+    d = β W − H(x, DW)
+
+If G is a sum of quadratic polynomials b u + c u² of single inputs, the minimum over a box is a function of b and c with
+the derivatives u* and u*², where u* is the minimiser (Danskin's theorem). A finite set is enumerated. Over a ball G may
+be affine, or c|u|² plus an affine function, and over a simplex affine. In other problems the set is cut into pieces and
+the control is one more coordinate of the cells.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Ball, Box, Finite, Simplex, extremes
+from hjbjax.tracing import intervals as iv
+from hjbjax.tracing import quadratics as qu
+from hjbjax.tracing import taylor_forms as tf
+from hjbjax.tracing.intervals import Interval, point
+from hjbjax.tracing.taylor_forms import Form
+
+PIECES = {1: 64, 2: 16, 3: 8}  # pieces per input where there is no formula
+Actions = list[Interval]  # the range of every input
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A candidate W over parts of cells.
+
+    Attributes:
+      x: the state.
+      radii: the largest distance from the centre along every axis.
+      w: the candidate.
+      p: its gradient.
+    """
+
+    x: list[Form]
+    radii: list[np.ndarray]
+    w: Form
+    p: list[Form]
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """The defect over parts of cells.
+
+    Attributes:
+      defect: the range of β W − H.
+      rate: the range of β.
+      least: for each set of coordinates that a wall stops, an upper bound of β W − H without their motion.
+      drift: the range of every component of the drift under the minimisers.
+      policy: a control near the minimiser at the centre, shape (count, m); proves nothing.
+    """
+
+    defect: Interval
+    rate: Interval
+    least: dict[frozenset[int], np.ndarray]
+    drift: list[Interval]
+    policy: np.ndarray
+
+
+def outcome(problem: Problem, cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> Outcome:
+    """The defect of a candidate.
+
+    Args:
+      problem: a problem of one player with costs.
+      cell: the candidate.
+      stopped: sets of coordinates whose motion a wall may stop.
+    """
+    (rate,) = tf.taylor_forms(problem.discount, *([cell.x] * callable(problem.discount))).reshape(-1)
+    if isinstance(problem.controls, Finite):
+        return _enumerated(problem, cell, rate, stopped)
+    count = 0 if problem.controls is None else problem.controls.dim
+    try:
+        drift = qu.quadratics(problem.drift, cell.x, count)
+        cost: qu.Terms = {(): tf.constant(0.0)}
+        if problem.cost is not None:
+            cost = qu.quadratics(problem.cost, cell.x, count)[0]
+        return _by_formula(problem, cell, rate, stopped, drift, cost)
+    except qu.NotQuadraticError:
+        return _by_pieces(problem, cell, rate, stopped)
+
+
+def _by_formula(
+    problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]], drift: list[qu.Terms],
+    cost: qu.Terms,
+) -> Outcome:  # fmt: skip
+    """By the minimum of a quadratic polynomial of the control."""
+
+    def defect(without: frozenset[int]) -> tuple[Interval, Actions, list[np.ndarray]]:
+        total = cost
+        for i, (component, slope) in enumerate(zip(drift, cell.p, strict=True)):
+            if i not in without:
+                total = qu.add(total, qu.multiply(component, {(): slope}))
+        least, actions, near = least_over(problem.controls, total)
+        return tf.subtract(tf.multiply(rate, cell.w), least).bounds(cell.radii), actions, near
+
+    found, actions, near = defect(frozenset())
+    return Outcome(
+        found, rate.range, {each: defect(each)[0].hi for each in stopped},
+        [range_over(component, actions) for component in drift], _stacked(near, cell),
+    )  # fmt: skip
+
+
+def _stacked(inputs: Sequence[np.ndarray], cell: Cell) -> np.ndarray:
+    """The inputs of a control as one array (count, m)."""
+    rows = [np.broadcast_to(each, np.shape(cell.w.range.lo)) for each in inputs]
+    return np.stack(rows, axis=-1) if rows else np.zeros((*np.shape(cell.w.range.lo), 0))
+
+
+def range_over(terms: qu.Terms, actions: Actions) -> Interval:
+    """The range of a polynomial over a box of controls and over cells."""
+    total = point(0.0)
+    for term, coefficient in terms.items():
+        if len(term) == 2 and term[0] == term[1]:
+            total = total + coefficient.range * iv.squared(actions[term[0]])
+            continue
+        product = coefficient.range
+        for j in term:
+            product = product * actions[j]
+        total = total + product
+    return total
+
+
+def least_over(admissible: Any, terms: qu.Terms) -> tuple[Form, Actions, list[np.ndarray]]:
+    """The minimum of a polynomial over a set, the ranges of the minimisers, and a minimiser at the centre.
+
+    Raises:
+      NotQuadraticError: there is no formula for this polynomial and this set.
+    """
+    zero = tf.constant(0.0)
+    least = terms.get((), zero)
+    if admissible is None:
+        return least, [], []
+    count = admissible.dim
+    b = [terms.get((j,), zero) for j in range(count)]
+    squares = [terms.get((j, j)) for j in range(count)]
+    if any(len(term) == 2 and term[0] != term[1] for term in terms):
+        raise qu.NotQuadraticError
+    if isinstance(admissible, Box):
+        lo, hi = np.asarray(admissible.lo, float), np.asarray(admissible.hi, float)
+        actions, near = [], []
+        for j in range(count):
+            part, action, middle = least_quadratic(b[j], squares[j] or zero, lo[j], hi[j])
+            least = tf.add(least, part)
+            actions.append(action)
+            near.append(middle)
+        return least, actions, near
+    if isinstance(admissible, Ball):
+        radius = float(admissible.radius)
+        length = norm(b)
+        part, _, distance = least_quadratic(tf.negative(length), _common(squares), 0.0, radius)
+        whole = Interval(np.array(-radius), np.array(radius))
+        size = np.maximum(length.centre.hi, iv.TINY)
+        return tf.add(least, part), [whole] * count, [-distance * each.centre.lo / size for each in b]
+    if isinstance(admissible, Simplex) and not any(squares):
+        total = float(admissible.total)
+        options = b + [zero] * admissible.at_most
+        whole = Interval(np.array(0.0), np.array(total))
+        best = np.argmin(np.stack(np.broadcast_arrays(*(each.centre.lo for each in options))), axis=0)
+        near = [np.where(best == j, total, 0.0) for j in range(count)]
+        return tf.add(least, tf.multiply(tf.constant(total), tf.minimum(*options))), [whole] * count, near
+    raise qu.NotQuadraticError
+
+
+def _common(squares: Sequence[Form | None]) -> Form:
+    """The coefficient of |u|², which must be one number for all inputs."""
+    known = [each for each in squares if each is not None]
+    if not known:
+        return tf.constant(0.0)
+    ends = {(float(each.range.lo), float(each.range.hi)) for each in known if np.size(each.range.lo) == 1}
+    if len(known) < len(squares) or len(ends) != 1 or any(each.slopes or np.size(each.range.lo) > 1 for each in known):
+        raise qu.NotQuadraticError
+    return known[0]
+
+
+def norm(b: Sequence[Form]) -> Form:
+    """The Euclidean norm; the derivative where it may be zero is that of all directions."""
+
+    def function(*ranges: Interval) -> Interval:
+        total = iv.squared(ranges[0])
+        for each in ranges[1:]:
+            total = total + iv.squared(each)
+        return iv.root(Interval(np.maximum(total.lo, 0.0), total.hi))
+
+    def derivatives(*ranges: Interval) -> list[Interval]:
+        length = function(*ranges)
+        found = [each / length for each in ranges]
+        return [Interval(np.maximum(each.lo, -1.0), np.minimum(each.hi, 1.0)) for each in found]
+
+    def seconds(*ranges: Interval) -> tf.Curvature:
+        length = function(*ranges)
+        cubed = iv.power(length, 3)
+        found: tf.Curvature = {}
+        for i, j in itertools.combinations_with_replacement(range(len(ranges)), 2):
+            found[i, j] = -(ranges[i] * ranges[j] / cubed)
+            if i == j:
+                others = point(0.0)
+                for k, other in enumerate(ranges):
+                    if k != i:
+                        others = others + iv.squared(other)
+                found[i, j] = others / cubed
+        return found
+
+    return tf.apply(function, derivatives, seconds, *b)
+
+
+def least_quadratic(b: Form, c: Form, lo: float, hi: float) -> tuple[Form, Interval, np.ndarray]:
+    """The minimum of b u + c u² over lo ≤ u ≤ hi, the range of the minimiser, and a minimiser at the centre."""
+
+    def function(slope: Interval, curvature: Interval) -> Interval:
+        # concave in the slope and increasing in the curvature: least at ends of both
+        low = [_lower_bound(end, curvature.lo, lo, hi) for end in slope.ends]
+        u = minimiser(slope, curvature, lo, hi)
+        tried = [each for each in (u.lo, u.hi, (u.lo + u.hi) / 2) if np.all(np.isfinite(each))]
+        high = [(slope * point(u) + curvature * iv.squared(point(u))).hi for u in tried]
+        most = np.minimum.reduce(high) if high else np.full(np.shape(low[0]), np.inf)
+        return Interval(np.minimum(*low), most)
+
+    def derivatives(slope: Interval, curvature: Interval) -> tuple[Interval, Interval]:
+        u = minimiser(slope, curvature, lo, hi)
+        return u, iv.squared(u)
+
+    def seconds(slope: Interval, curvature: Interval) -> tf.Curvature:
+        u = minimiser(slope, curvature, lo, hi)
+        free = -(slope / curvature.scaled(2.0))
+        inside, outside = (free.lo > lo) & (free.hi < hi), (u.lo == u.hi)
+        zero = point(0.0)
+        response = -(point(0.5) / curvature)  # of the minimiser to the slope, where it is inside
+        response = iv.choose(inside, response, iv.union(response, zero))
+        # without curvature the minimiser jumps from one end to the other
+        response = iv.choose(curvature.lo > 0, response, iv.entire(response))
+        response = iv.choose(outside & ~inside, zero, response)
+        return {(0, 0): response, (0, 1): (response * u).scaled(2.0), (1, 1): (response * iv.squared(u)).scaled(4.0)}
+
+    at_centre = minimiser(b.centre, c.centre, lo, hi)
+    middle = np.clip(np.nan_to_num((at_centre.lo + at_centre.hi) / 2), lo, hi)
+    return tf.apply(function, derivatives, seconds, b, c), minimiser(b.range, c.range, lo, hi), middle
+
+
+def minimiser(slope: Interval, curvature: Interval, lo: float, hi: float) -> Interval:
+    """All minimisers of b u + c u² over lo ≤ u ≤ hi."""
+    low, high = point(np.asarray(lo)), point(np.asarray(hi))
+    free = -(slope / curvature.scaled(2.0))
+    inside = Interval(np.clip(free.lo, lo, hi), np.clip(free.hi, lo, hi))
+    # a convex polynomial is least at an end where its derivative there has the right sign
+    two = point(2.0)
+    at_low = (slope + two * curvature * low).lo >= 0 if np.isfinite(lo) else np.zeros((), bool)
+    at_high = (slope + two * curvature * high).hi <= 0 if np.isfinite(hi) else np.zeros((), bool)
+    convex = curvature.lo >= 0
+    found = iv.choose(curvature.lo > 0, inside, Interval(low.lo, high.lo))
+    found = iv.choose(convex & at_low, low, found)
+    return iv.choose(convex & at_high, high, found)
+
+
+def _lower_bound(slope: np.ndarray, curvature: np.ndarray, lo: float, hi: float) -> np.ndarray:
+    """A lower bound of the minimum of b u + c u² for numbers b and c."""
+    b, c = point(slope), point(curvature)
+    ends = [(b * point(end) + c * iv.squared(point(end))).lo for end in (lo, hi)]
+    with np.errstate(all="ignore"):
+        free = (-(iv.squared(b) / (c.scaled(4.0)))).lo  # −b²/4c, the minimum over all u
+    u = minimiser(b, c, lo, hi)
+    at_end = (u.hi <= lo) | (u.lo >= hi) | (curvature <= 0)
+    least_end = np.minimum(*ends)
+    # a convex polynomial whose minimiser is an end; a concave one is least at an end as well
+    return np.where(at_end & np.isfinite(least_end), least_end, np.where(curvature > 0, free, -np.inf))
+
+
+def _enumerated(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]]) -> Outcome:
+    """By enumeration of a finite set."""
+    costs: dict[frozenset[int], list[Form]] = {each: [] for each in (frozenset[int](), *stopped)}
+    speeds: list[list[Interval]] = []
+    for u in np.asarray(problem.controls.points, float):
+        action = [tf.constant(each) for each in u]
+        drift = list(tf.taylor_forms(problem.drift, cell.x, action))
+        paid = _running_cost(problem, cell.x, action)
+        for without, found in costs.items():
+            found.append(_hamiltonian(paid, drift, cell.p, without))
+        speeds.append([each.range for each in drift])
+    whole = tf.multiply(rate, cell.w)
+    points, gains = np.asarray(problem.controls.points, float), [each.centre.lo for each in costs[frozenset()]]
+    best = np.argmin(np.stack(np.broadcast_arrays(*gains)), axis=0)
+    bounds = {without: tf.subtract(whole, tf.minimum(*found)).bounds(cell.radii) for without, found in costs.items()}
+    return Outcome(
+        bounds[frozenset()], rate.range, {each: bounds[each].hi for each in stopped},
+        [iv.union(*each) for each in zip(*speeds, strict=True)], points[best],
+    )  # fmt: skip
+
+
+def _running_cost(problem: Problem, x: list[Form], u: list[Form]) -> Form:
+    return tf.constant(0.0) if problem.cost is None else tf.taylor_forms(problem.cost, x, u).item()
+
+
+def _hamiltonian(paid: Form, drift: Sequence[Form], p: Sequence[Form], without: frozenset[int]) -> Form:
+    """L + f·p, without some components of the drift."""
+    for i, (component, slope) in enumerate(zip(drift, p, strict=True)):
+        if i not in without:
+            paid = tf.add(paid, tf.multiply(component, slope))
+    return paid
+
+
+def _by_pieces(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]]) -> Outcome:
+    """By cutting the set into pieces: the control is one more coordinate of each box."""
+    n, whole = len(cell.x), tf.multiply(rate, cell.w)
+    high = {each: np.asarray(-np.inf) for each in (frozenset[int](), *stopped)}
+    low = np.asarray(-np.inf)
+    policy = np.zeros((*np.shape(cell.w.range.lo), problem.controls.dim))
+    speeds: list[list[Interval]] = []
+    for box, centre, inside in pieces(problem.controls):
+        radii = [
+            *cell.radii,
+            *(np.nextafter((each.hi - each.lo) / 2 + iv.EPS * np.abs(each.hi), np.inf) for each in box),
+        ]
+        action = tf.coordinates(box, [point(c) for c in centre], n + len(box), n)
+        drift = list(tf.taylor_forms(problem.drift, cell.x, action))
+        paid = _running_cost(problem, cell.x, action)
+        for without in high:
+            gain = tf.subtract(whole, _hamiltonian(paid, drift, cell.p, without))
+            high[without] = np.maximum(high[without], gain.bounds(radii).hi)
+            if not without and inside:  # the derivatives over the piece contain those at its centre
+                at_centre = dataclasses.replace(gain, range=iv.entire(gain.range))
+                still = [*cell.radii, *(np.zeros(()) for _ in box)]
+                found = at_centre.bounds(still).lo
+                policy = np.where((found > low)[..., None], centre, policy)
+                low = np.maximum(low, found)
+        speeds.append([each.range for each in drift])
+    return Outcome(
+        Interval(low, high[frozenset()]), rate.range, {each: high[each] for each in stopped},
+        [iv.union(*each) for each in zip(*speeds, strict=True)], policy,
+    )  # fmt: skip
+
+
+def pieces(admissible: Any) -> list[tuple[list[Interval], np.ndarray, bool]]:
+    """Boxes that cover a set: their ranges, their centres, and True if the centre belongs to the set.
+
+    Raises:
+      ValueError: the set has too many inputs, or no boxes cover it.
+    """
+    count = admissible.dim
+    if count not in PIECES or isinstance(admissible, Simplex) or getattr(admissible, "unbounded", False):
+        raise ValueError(
+            f"enclose: got controls={admissible!r:.80} with a drift or a cost that is not a quadratic polynomial of\n"
+            "single inputs; wanted such a polynomial, or a bounded Box or Ball of at most three inputs, or a Finite set"
+        )
+    corners = np.asarray(extremes(admissible), float)
+    lo, hi = corners.min(axis=0), corners.max(axis=0)
+    steps = PIECES[count]
+    edges = [(lo * (steps - k) + hi * k) / steps for k in range(steps + 1)]
+    edges[0], edges[-1] = lo, hi
+    found = []
+    for index in itertools.product(range(steps), repeat=count):
+        ends = [(edges[k][j], edges[k + 1][j]) for j, k in enumerate(index)]
+        centre = np.array([(a + b) / 2 for a, b in ends])
+        inside = True
+        if isinstance(admissible, Ball):
+            radius = float(admissible.radius)
+            nearest = np.array([0.0 if a <= 0 <= b else min(abs(a), abs(b)) for a, b in ends])
+            if np.linalg.norm(nearest) > radius * (1 + 1e-12):
+                continue
+            inside = bool(np.linalg.norm(centre) <= radius * (1 - 1e-12))
+        found.append(([Interval(np.asarray(a), np.asarray(b)) for a, b in ends], centre, inside))
+    return found

@@ -1,0 +1,215 @@
+"""Bounds on the true value hold at all states, close with the mesh, and are refused where nothing is proved."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import hjbjax as hjb
+
+BETA = 0.7
+
+
+def near(grid, value, error=0.0):
+    """A solution whose node values are the exact ones, up to an error that varies from node to node."""
+    nodes = grid.nodes()
+    with jax.enable_x64(True):
+        flat = np.asarray(jax.vmap(value)(nodes.reshape(-1, grid.ndim))).reshape(grid.shape)
+    wave = np.sin(np.sum(37 * nodes, axis=-1))
+    return hjb.Solution(grid, flat + error * np.ptp(flat) * wave, None, code=hjb.Status.CONVERGED)
+
+
+def check(found, value, lo, hi, count=2000, seed=0):
+    """The value is between the bounds at random states; returns the largest width there relative to its range."""
+    states = np.random.default_rng(seed).uniform(lo, hi, (count, len(lo)))
+    with jax.enable_x64(True):
+        exact = np.asarray(jax.vmap(value)(states))
+    low, high = found.lower_at(states), found.upper_at(states)
+    assert np.all(low <= exact)
+    assert np.all(exact <= high)
+    return float(np.max(high - low) / np.ptp(exact))
+
+
+def manufactured(value, drift, least, controls, rate=BETA):
+    """The problem with a chosen value: L = q + |u|²/2 with q = β V − min over u of |u|²/2 + f·DV.
+
+    Args:
+      value: V.
+      drift: f(x, u), affine in u.
+      least: the minimum over the admissible u of |u|²/2 + b·u, as a function of b.
+      controls: the set of u.
+      rate: β.
+    """
+
+    def cost(x, u):
+        still = jnp.zeros_like(u)
+        slope = jax.grad(value)(x)
+        gain = jax.jacfwd(drift, 1)(x, still).T @ slope
+        return rate * value(x) - drift(x, still) @ slope - least(gain) + u @ u / 2
+
+    return hjb.Problem(drift, cost, controls, discount=rate)
+
+
+def in_box(bound):
+    return lambda b: jnp.sum(jnp.clip(-b, -bound, bound) * (b + jnp.clip(-b, -bound, bound) / 2))
+
+
+def wave(draw, n):
+    """A random periodic function on [0, 1]^n."""
+    numbers = draw.normal(size=(2, n + 1))
+
+    def value(x):
+        angle = 2 * jnp.pi * x
+        inner = sum(numbers[0, k] * jnp.sin(angle[k] + numbers[1, k]) for k in range(n))
+        return inner + 0.2 * numbers[0, n] * jnp.exp(jnp.cos(angle[0])) * jnp.sin(angle[-1])
+
+    return value
+
+
+def random_problem(seed, n):
+    """A random nonlinear problem on the torus with its exact value."""
+    draw = np.random.default_rng(seed)
+    value, fields = wave(draw, n), [wave(draw, n) for _ in range(2 * n)]
+    reach = draw.uniform(0.3, 3.0)
+
+    def drift(x, u):
+        return jnp.stack([0.3 * fields[k](x) + (1 + 0.2 * jnp.sin(fields[n + k](x))) * u[k] for k in range(n)])
+
+    return manufactured(value, drift, in_box(reach), hjb.Box([-reach] * n, [reach] * n)), value
+
+
+def test_the_value_of_a_random_problem_is_enclosed_and_the_bounds_close_with_the_mesh():
+    problem, value = random_problem(0, 1)
+    widths = []
+    for count in (24, 48):
+        grid = hjb.Grid([0.0], [1.0], (count,), periodic=(True,))
+        found = hjb.enclose(problem, near(grid, value, 1e-3), rounds=2)
+        widths.append(check(found, value, [-1.0], [2.0]))
+        assert np.all(found.lower <= found.upper)
+        np.testing.assert_array_equal(found.lower, found.lower_at(grid.nodes()))
+    assert widths[1] < 0.5 * widths[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_values_of_many_random_problems_are_enclosed(n):
+    for seed in range(300 if n == 1 else 40):
+        problem, value = random_problem(100 + seed, n)
+        grid = hjb.Grid([0.0] * n, [1.0] * n, (32,) * n, periodic=(True,) * n)
+        check(hjb.enclose(problem, near(grid, value, 1e-3), rounds=3), value, [0.0] * n, [1.0] * n, seed=seed)
+
+
+@pytest.mark.slow
+def test_a_smooth_value_is_enclosed_between_walls():
+    problem, grid = hjb.zoo.smooth(shape=(33, 33))
+    exact = hjb.zoo.smooth_exact()
+    found = hjb.enclose(problem, near(grid, exact))
+    assert check(found, exact, [-0.4, -0.4], [0.4, 0.4]) < 0.1
+    assert found.status is hjb.Status.MAX_STEPS
+    assert "walls at the projected ends" in found.message
+
+
+@pytest.mark.slow
+def test_the_bounds_close_with_the_mesh_faster_than_linearly():
+    exact, widths = hjb.zoo.smooth_exact(), []
+    for count in (41, 81):
+        problem, grid = hjb.zoo.smooth(shape=(count, count))
+        found = hjb.enclose(problem, hjb.solve(problem, grid))
+        widths.append(check(found, exact, [-0.5, -0.45], [0.5, 0.45], 100_000))
+    assert np.log2(widths[0] / widths[1]) > 1.5
+    assert widths[1] < 0.005
+
+
+def riccati():
+    """The double integrator with a quadratic cost, and its value x'Px."""
+    rate, a, b = 1.0, np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    p = scipy.linalg.solve_continuous_are(a - rate / 2 * np.eye(2), b, np.eye(2), np.eye(1))
+    problem = hjb.Problem(
+        lambda x, u: jnp.stack([x[1], u[0]]), lambda x, u: x @ x + u @ u, hjb.Box([-np.inf], [np.inf]), discount=rate
+    )
+    return problem, lambda x: x @ p @ x
+
+
+@pytest.mark.slow
+def test_the_riccati_value_is_enclosed_in_the_inner_half_of_a_large_box():
+    problem, exact = riccati()
+    grid = hjb.Grid([-4.0, -4.0], [4.0, 4.0], (61, 61))
+    found = hjb.enclose(problem, hjb.solve(problem, grid))
+    assert check(found, exact, [-2.0, -2.0], [2.0, 2.0], 100_000) < 0.1
+
+
+def wells(x):
+    """V of x' = u, |u| ≤ 1, with the cost |distance to the nearer of ±1| and the discount 1: a concave kink at zero."""
+    distance = jnp.abs(jnp.abs(x[0]) - 1)
+    return distance - 1 + jnp.exp(-distance)
+
+
+SETS = [hjb.Box([-1.0], [1.0]), hjb.Finite([[-1.0], [0.0], [1.0]]), hjb.Ball(1.0, 1)]
+
+
+@pytest.mark.parametrize("controls", [SETS[0], *(pytest.param(each, marks=pytest.mark.slow) for each in SETS[1:])])
+def test_a_value_with_a_concave_kink_is_enclosed(controls):
+    problem = hjb.Problem(
+        lambda x, u: u, lambda x, u: jnp.minimum(jnp.abs(x[0] - 1), jnp.abs(x[0] + 1)), controls, discount=1.0
+    )
+    widths = []
+    for count in (41, 81):
+        grid = hjb.Grid([-2.0], [2.0], (count,))
+        found = hjb.enclose(problem, near(grid, wells))
+        check(found, wells, [-2.0], [2.0])
+        widths.append(np.median(found.width))
+    assert widths[1] < 0.6 * widths[0] < 0.1
+
+
+@pytest.mark.slow
+def test_a_control_without_a_formula_is_enclosed():
+    """The drift sin u and the cost u²/2 + cos u: the minimum over the control is found by pieces."""
+    problem = hjb.Problem(
+        lambda x, u: jnp.sin(u), lambda x, u: x @ x + 1 - jnp.cos(u[0]), hjb.Box([-2.0], [2.0]), discount=1.0
+    )
+    grid = hjb.Grid([-1.0], [1.0], (41,))
+    solution = hjb.solve(problem, grid)
+    found = hjb.enclose(problem, solution)
+    assert np.all(found.lower <= solution.value + 1e-3)
+    assert np.all(solution.value - 1e-3 <= found.upper)
+    assert np.max(found.width) < 0.1 * np.ptp(solution.value)
+
+
+def test_rewards_change_the_sides_and_a_discount_may_depend_on_the_state():
+    """V = −v for a chosen v, with the discount 1 + v²."""
+    value = wave(np.random.default_rng(5), 1)
+    costs = manufactured(value, lambda x, u: u, in_box(2.0), hjb.Box([-2.0], [2.0]), 1.0)
+    rewards = hjb.Problem(
+        costs.drift, controls=costs.controls, reward=lambda x, u: -costs.cost(x, u) - value(x) ** 3,
+        discount=lambda x: 1.0 + value(x) ** 2,
+    )  # fmt: skip
+    grid = hjb.Grid([0.0], [1.0], (40,), periodic=(True,))
+    solution = hjb.Solution(grid, near(grid, lambda x: -value(x)).value, None, labels=rewards.labels)
+    check(hjb.enclose(rewards, solution, rounds=1), lambda x: -value(x), [0.0], [1.0])
+
+
+def test_what_is_not_proved_is_refused():
+    line = hjb.Grid([-1.0], [1.0], (11,))
+    base = {"drift": lambda x, u: u, "cost": lambda x, u: x @ x, "controls": hjb.Box([-1.0], [1.0])}
+    solution = near(line, lambda x: x @ x)
+    for more, word in (
+        ({}, "no discount"),
+        ({"discount": 1.0, "noise": 0.1}, "noise"),
+        ({"discount": 1.0, "target": lambda x: jnp.abs(x[0]) - 0.1}, "target"),
+        ({"discount": 1.0, "stopping_cost": 1.0}, "stopping_cost"),
+        ({"discount": 1.0, "growth": lambda x, u: 0.1}, "growth"),
+    ):
+        with pytest.raises(ValueError, match=f"got .*{word}"):
+            hjb.enclose(hjb.Problem(**base, **more), solution)
+    problem = hjb.Problem(**base, discount=1.0)
+    with pytest.raises(ValueError, match="open ends"):
+        hjb.enclose(problem, near(hjb.Grid([-1.0], [1.0], (11,), edges="open"), lambda x: x @ x))
+    with pytest.raises(MemoryError):
+        hjb.enclose(problem, solution, max_memory=1000)
+    table = jnp.arange(3.0)
+    looked_up = hjb.Problem(base["drift"], lambda x, u: jnp.interp(x[0], table, table), base["controls"], discount=1.0)
+    with pytest.raises(ValueError, match="there is no interval rule"):
+        hjb.enclose(looked_up, solution)
+    with pytest.raises(ValueError, match="infinite"):
+        hjb.enclose(hjb.Problem(lambda x, u: u / x, base["cost"], base["controls"], discount=1.0), solution)

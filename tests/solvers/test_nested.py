@@ -94,10 +94,12 @@ def test_the_grid_that_tells_the_error_is_where_a_large_solve_begins(iterations)
     problem, grid = zoo.smooth(shape=(145, 145))
     solution = hjb.solve(problem, grid)
     fine, half = (145, 145), (73, 73)
-    assert iterations == [("Upwind", half), ("Upwind", fine), ("Limited", fine), ("Limited", half)]
+    # on the coarser grid the second order first runs roughly, for an estimate of the error of the grid
+    assert iterations[:5] == [("Upwind", half), ("Upwind", fine), *[("Limited", half)] * 2, ("Limited", fine)]
+    begun = len(iterations)
     assert solution.stats["levels"] == [half, fine]
     alone = hjb.solve(problem, grid, method=METHOD)  # asked for, on one grid
-    assert iterations[4] == ("Upwind", fine)
+    assert iterations[begun] == ("Upwind", fine)
     assert alone.stats["levels"] == [fine]
     np.testing.assert_allclose(solution.value, alone.value, rtol=0, atol=2e-3)  # each to a residual of 1e-3
     assert np.max(solution.grid_error) == pytest.approx(np.max(alone.grid_error), rel=0.05)

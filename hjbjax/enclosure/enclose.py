@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hjbjax.enclosure import correction, defect
+from hjbjax.enclosure import correction, defect, walls
 from hjbjax.enclosure.defect import Defects
 from hjbjax.enclosure.interpolant import AxisTable, Spline, axis_table
 from hjbjax.problem import arguments
@@ -92,6 +92,7 @@ def enclose(
         middle, found = task.corrected(value)
         lower = task.bound(middle, found, 1, count)
         upper = task.bound(middle, found, -1, count)
+        remaining = walls.remaining(own, grid, Spline(task.tables, value))
     if problem.payoff == REWARD:
         lower, upper = upper.negative(), lower.negative()
     nodes = grid.nodes().reshape(-1, grid.ndim)
@@ -99,7 +100,9 @@ def enclose(
     share = float(np.mean(high - low)) / scale
     stats = {"seconds": time.perf_counter() - start, "bytes": needed, "corrections": len(lower.shifts + upper.shifts)}
     status = Status.CONVERGED if share <= tol else Status.MAX_STEPS
-    return Enclosure(solution.grid, low, high, status, _message(solution.grid, share, tol), stats, (lower, upper))
+    return Enclosure(
+        solution.grid, low, high, status, _message(solution.grid, share, tol), stats, remaining, (lower, upper)
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,6 +149,9 @@ class Enclosure:
         in both cases.
       message: the problem that the bounds refer to, and their mean width.
       stats: "seconds", "bytes" (the estimated memory) and "corrections".
+      remaining: e^{−βT} at the nodes, shape (*grid), where T is a lower bound of the time until a path can meet a
+        projected end. If the problem continues beyond the box, its value differs from the value between walls by at
+        most this factor times the largest difference at the ends. Zero without projected ends.
       bounds: the lower and the upper bound as functions.
     """
 
@@ -155,6 +161,7 @@ class Enclosure:
     status: Status
     message: str
     stats: dict
+    remaining: np.ndarray
     bounds: tuple[Bound, Bound] = dataclasses.field(repr=False)
 
     @property
@@ -358,8 +365,8 @@ def peak_bytes(problem: Problem, grid: Grid) -> int:
 
 def _message(grid: Grid, share: float, tol: float) -> str:
     """The statement that is proved, and its width."""
-    walls = bool(grid.sides("projected"))
-    which = "the problem with walls at the projected ends of the box" if walls else "the continuous problem"
+    with_walls = bool(grid.sides("projected"))
+    which = "the problem with walls at the projected ends of the box" if with_walls else "the continuous problem"
     end = "" if share <= tol else f", above tol = {tol:g}: use more nodes, or a better solution"
     return f"The value of {which} lies between the bounds; their mean width is {share:.2g} of the range of V{end}."
 

@@ -313,7 +313,7 @@ def _by_pieces(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[froze
     for box, centre, inside in pieces(problem.controls):
         radii = [
             *cell.radii,
-            *(np.nextafter((each.hi - each.lo) / 2 + iv.EPS * np.abs(each.hi), np.inf) for each in box),
+            *(np.nextafter((each.hi - each.lo) / 2 + iv.EPS * iv.size(each).hi, np.inf) for each in box),
         ]
         action = tf.coordinates(box, [point(c) for c in centre], n + len(box), n)
         drift = list(tf.taylor_forms(problem.drift, cell.x, action))

@@ -62,8 +62,10 @@ class Form:
         first = second = self.centre
         sides = [Interval(-radius, radius) for radius in radii]
         for slope, at_centre, side in zip(self.slopes, self.gradient, sides, strict=False):
-            if slope is not None and at_centre is not None:
-                first, second = first + slope * side, second + at_centre * side
+            if slope is not None:
+                first = first + slope * side
+            if at_centre is not None:
+                second = second + at_centre * side
         for (i, j), curvature in self.curvature.items():
             half = Interval(np.zeros_like(radii[i]), (sides[i] * sides[i]).hi / 2)
             second = second + curvature * (half if i == j else sides[i] * sides[j])
@@ -490,7 +492,8 @@ def selected(which: Form, cases: Sequence[Form]) -> Form:
 
 def _hull_of_cases(choice: Interval, parts: Sequence[Interval]) -> Interval:
     """The hull of the cases that may be chosen."""
-    first, last = (np.asarray(end).astype(int) for end in choice.ends)
+    # infinite bounds of an index would become arbitrary integers
+    first, last = (np.clip(np.asarray(end, float), 0, len(parts) - 1).astype(int) for end in choice.ends)
     total: Interval | None = None
     is_boolean = parts[0].lo.dtype == bool
     for k, part in enumerate(parts):
@@ -584,6 +587,8 @@ class _Scalars:
             return x
         if name in SMOOTH:
             return smooth(name, x)
+        if name == "div" and not np.issubdtype(dtypes[0], np.floating):
+            raise refusal("an integer division")
         if name in BINARY:
             return BINARY[name](*operands)
         if name in COMPARISONS and all(each.range.lo.dtype == bool for each in operands) >= (name in LOGICAL):

@@ -212,12 +212,29 @@ def test_the_range_of_terms_that_cancel_falls_with_the_third_power_of_the_width(
     [
         (lambda x: jax.lax.while_loop(lambda y: y[0] < 1, lambda y: y + 1, x)[0], "while"),
         (lambda x: jnp.array([1.0, 2.0])[x[0].astype(int)], "dynamic_slice with an index that depends on the state"),
+        (lambda x: (x[0].astype(int) // 2) * 1.0, "an integer division"),
         (lambda x: x[0] * jnp.linalg.inv(jnp.eye(2) + 1.0)[0, 0], "lu"),
     ],
 )
 def test_a_primitive_without_a_rule_is_refused_by_name(function, name):
     with pytest.raises(ValueError, match=f"uses {name}, for which there is no interval rule"):
         bounds_of(function, *boxes_in(np.random.default_rng(0), -1, 1))
+
+
+def branches(x):
+    """A switch whose index depends on the state, also beyond its branches."""
+    index = jnp.floor(1.5 * x[0]).astype(int) + 1
+    return jax.lax.switch(index, [lambda y: y[1], lambda y: y[0] * y[1], lambda y: 2.0 + y[0]], x)
+
+
+def test_a_switch_that_depends_on_the_state_is_in_its_range():
+    draw = np.random.default_rng(1)
+    low, high, middle, radii = boxes_in(draw, -3, 3)
+    least, most = bounds_of(branches, low, high, middle, radii)
+    with jax.enable_x64(True):
+        for _ in range(20):
+            found = np.asarray(jax.vmap(branches)(low + draw.random(low.shape) * (high - low)))
+            assert np.all((least <= found) & (found <= most))
 
 
 def test_polynomials_of_the_control_have_their_coefficients():

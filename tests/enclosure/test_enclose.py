@@ -100,13 +100,13 @@ def test_the_values_of_many_random_problems_are_enclosed(n):
         check(hjb.enclose(problem, near(grid, value, 1e-3), rounds=3), value, [0.0] * n, [1.0] * n, seed=seed)
 
 
-@pytest.mark.slow
-def test_a_smooth_value_is_enclosed_between_walls():
-    problem, grid = hjb.zoo.smooth(shape=(33, 33))
-    exact = hjb.zoo.smooth_exact()
+def test_a_quadratic_value_is_enclosed_on_a_stretched_axis():
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-3.0], [3.0]), discount=1.0)
+    grid = hjb.Grid([-1.0], [1.0], (41,), stretch=(hjb.Sinh(2.0, 0.4),))
+    exact = lambda x: (5**0.5 - 1) / 2 * (x @ x)  # noqa: E731
     found = hjb.enclose(problem, near(grid, exact))
-    assert check(found, exact, [-0.4, -0.4], [0.4, 0.4]) < 0.1
-    assert found.status is hjb.Status.MAX_STEPS
+    assert check(found, exact, [-1.0], [1.0]) < 1e-2
+    assert found.status is hjb.Status.CONVERGED
     assert "walls at the projected ends" in found.message
 
 
@@ -172,7 +172,8 @@ def test_a_value_with_a_concave_kink_is_enclosed(controls):
         found = hjb.enclose(problem, near(grid, wells))
         check(found, wells, [-2.0], [2.0])
         widths.append(np.median(found.width))
-    assert widths[1] < 0.6 * widths[0] < 0.1
+    assert widths[1] < 0.6 * widths[0]
+    assert widths[1] < 0.12
 
 
 @pytest.mark.slow

@@ -125,7 +125,8 @@ def solve(
       seed: of the weights and of all random states; the same seed gives the same result on the same machine.
       horizon: T, in units of time; the value then depends on (t, x) and is the terminal cost at T. ``None``: infinite.
       rest: a state near the rest point of an infinite horizon. ``None``: the origin.
-      quadratic: False leaves the linear-quadratic solution out of the value, for comparison.
+      quadratic: False leaves the linear-quadratic solution out of the value, for comparison. The training may then end
+        at another solution of the equation, such as a negative one.
       extremals: number of extremals for the training; 0 trains on the residual of the equation only.
       held_out: number of further extremals for the validation.
       steps: steps of the optimiser.

@@ -217,7 +217,7 @@ def test_a_manufactured_value_in_six_states():
         return 0.25 * slope @ slope - free(x) @ slope
 
     problem = hjb.Problem(lambda x, u: free(x) + u, lambda x, u: paid(x) + u @ u, hjb.Box([-50.0] * 6, [50.0] * 6))
-    found = neural.solve(problem, [-1.0] * 6, [1.0] * 6, seed=0)
+    found = neural.solve(problem, [-1.0] * 6, [1.0] * 6, seed=0, layers=(96, 96), steps=5000, extremals=24, held_out=0)
     states = np.random.default_rng(1).uniform(-1, 1, (2000, 6))
     exact = np.asarray(jax.vmap(value)(states))
     assert relative(found.value_at(states) - exact, exact) < 0.01

@@ -67,7 +67,12 @@ class Chase:
 
 @pytree_dataclass()
 class Adrift:
-    """The discounted time until a boat without a rudder catches the swimmer."""
+    """The discounted time (1 − e^{−βT})/β until a boat without a rudder catches the swimmer.
+
+    Args:
+      system: the boat and the swimmer.
+      discount: β.
+    """
 
     system: Chase
     discount: Number = 1.0

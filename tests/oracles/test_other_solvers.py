@@ -85,12 +85,7 @@ QUESTIONS = {
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow)
-        if name in ("one player", "game in the plane", "pursuit", "game on a line", "with noise", "minimum time")
-        else name
-        for name in QUESTIONS
-    ],
+    [pytest.param(name, marks=pytest.mark.emitters if name == "pursuit" else ()) for name in QUESTIONS],
 )
 @pytest.mark.filterwarnings("ignore:the Isaacs condition fails")
 def test_all_methods_agree_and_their_bounds_hold_the_discrete_solution(name):

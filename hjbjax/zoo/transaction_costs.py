@@ -111,7 +111,7 @@ def transaction_costs(
     Example:
       >>> problem, grid = transaction_costs(shape=(101,))
       >>> [push.direction for push in problem.pushes]
-      [(1.0,), (-1.0,)]
+      [(1,), (-1,)]
     """
     investor = Portfolio(interest, growth, volatility, discount, buying, selling)
     problem = Problem(

@@ -96,7 +96,7 @@ def estimate(
     method: Method | None = None,
     *,
     scheme: Scheme | None = None,
-    tol: float = 1e-3,
+    tol: float | None = None,
     dtype: DType | None = None,
     measure: bool = True,
 ) -> Estimate:

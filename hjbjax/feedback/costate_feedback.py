@@ -93,5 +93,9 @@ def costate_feedback(problem: Problem, solution: Any) -> CostateFeedback:
         if not influence(problem, n, np.dtype(np.float64)).noise.is_constant:
             raise ValueError(f"{name}: the noise depends on the control, and a solution without a grid has no D²V")
         rule = pointwise.rule_of(problem, n)
-    timed = getattr(solution, "horizon", None) is not None or getattr(solution, "times", None) is not None
-    return CostateFeedback(problem, solution, rule, timed)
+    return CostateFeedback(problem, solution, rule, takes_time(solution))
+
+
+def takes_time(solution: Any) -> bool:
+    """True if a solution without a grid, or its feedback, takes (t, x)."""
+    return getattr(solution, "horizon", None) is not None or getattr(solution, "times", None) is not None

@@ -22,7 +22,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.posing import for_solvers
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
-from hjbjax.feedback.costate_feedback import costate_feedback
+from hjbjax.feedback.costate_feedback import costate_feedback, takes_time
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.problem.grid import Grid
@@ -89,8 +89,7 @@ def without_grid(feedback: Any, time_varying: bool) -> tuple[Any, bool]:
     """
     if not hasattr(feedback, "control_at") or hasattr(feedback, "grid"):
         return feedback, time_varying
-    timed = getattr(feedback, "horizon", None) is not None or getattr(feedback, "times", None) is not None
-    return feedback.control_at, time_varying or timed
+    return feedback.control_at, time_varying or takes_time(feedback)
 
 
 def check_kept(solution: GridFeedback, duration: float, name: str) -> float:

@@ -147,6 +147,12 @@ def noise_or_none(noise: Number) -> Number | None:
     return noise if is_traced(noise) or np.any(np.asarray(noise) != 0) else None
 
 
+def two_modes(up: Number, down: Number) -> Array:
+    """The table of two modes, of rates or of costs, from its entries for the changes up and down."""
+    xp = jnp if is_traced(up, down) else np
+    return xp.asarray([[0.0, up], [down, 0.0]])
+
+
 def check_positive(owner: str, **numbers: object) -> None:
     """Check that parameters are positive; traced parameters are not checked.
 

@@ -6,16 +6,13 @@ Saving          consumption and saving with an income that changes at random
 
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
-
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.modes import Modes
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Box
-from hjbjax.problem.types import Array, Control, Number, State
-from hjbjax.zoo.ingredients import check_positive
+from hjbjax.problem.types import Control, Number, State
+from hjbjax.zoo.ingredients import check_positive, two_modes
 
 
 @pytree_dataclass()
@@ -80,7 +77,7 @@ def thermostat(
     """
     check_positive("thermostat", leak=leak, heating=heating, wear=wear, discount=discount)
     system = Thermostat(leak, outside, heating, wanted, fuel)
-    modes = Modes(("off", "on"), switching_cost=_table(wear, wear))
+    modes = Modes(("off", "on"), switching_cost=two_modes(wear, wear))
     problem = Problem(system.drift, system.cost, noise=noise, discount=discount, modes=modes)
     return problem, Grid([10.0], [30.0], shape, names=("temperature",))
 
@@ -149,13 +146,7 @@ def saving(
         controls=Box([0.2 * incomes[0]], [5 * incomes[1]]),
         reward=system.utility,
         discount=discount,
-        modes=Modes(("poor", "rich"), rates=_table(*rates)),
+        modes=Modes(("poor", "rich"), rates=two_modes(*rates)),
         control_names=("consumption",),
     )
     return problem, Grid([limit], [most], shape, names=("wealth",), edges="constrained")
-
-
-def _table(up: Number, down: Number) -> Array:
-    """A table of two modes from its two entries off the diagonal."""
-    xp: Any = jnp if is_traced(up, down) else np
-    return xp.asarray([[0.0, up], [down, 0.0]])

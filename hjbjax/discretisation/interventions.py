@@ -23,7 +23,7 @@ from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.problem.types import Field, Mask, Nodes
 
 Offset = tuple[int, ...]
-ROUNDING = 8  # units of eps in |c| + |V(x + o)|: a smaller distance of V to their sum is rounding
+ROUNDING = 8  # units of eps in |c + V(x + o)| + |V(x + o)|: a smaller distance of V to c + V(x + o) is rounding
 
 
 @pytree_dataclass(static=("offsets", "changes", "once"))
@@ -99,13 +99,11 @@ class Interventions:
 
     def impose(self, value: Field) -> Field:
         """V*, and exact equality with the value after an intervention where V is closer to it than rounding."""
-        after, size = jnp.full_like(value, jnp.inf), jnp.zeros_like(value)
-        for offset, cost in zip(self.offsets, self.costs, strict=True):
-            ahead = rolled(value, offset)
-            # V may be near zero where neither the cost nor V after the intervention is
-            size = jnp.where(cost + ahead < after, jnp.abs(cost) + jnp.abs(ahead), size)
-            after = jnp.minimum(after, cost + ahead)
-        near = jnp.isfinite(after) & (after - value <= ROUNDING * jnp.finfo(value.dtype).eps * size)
+        eps, near = jnp.finfo(value.dtype).eps, jnp.zeros_like(value, bool)
+        for offset, after in zip(self.offsets, self.after(value), strict=True):
+            # V may be near zero where neither V after the intervention nor the cost, their difference, is
+            size = jnp.abs(after) + jnp.abs(rolled(value, offset))
+            near |= jnp.isfinite(size) & (after - value <= ROUNDING * eps * size)
         exact = self.cheapest(jnp.where(near, jnp.inf, value))  # along whole paths, each node from the next one
         return jnp.where(jnp.isfinite(exact), exact, value)
 

@@ -56,6 +56,8 @@ NODES = 0.05  # ... at more than this fraction of the nodes
 
 CANNOT_MATTER = "no end of the box assumes anything"
 NEVER_REACHED = "no optimal path reaches an end of the box"
+UNMOVED = "the ends cut off drift, but V continued beyond them by straight lines is a solution too"
+FLAT = "not estimated: V is constant, which no other assumption at the ends changes"
 TOO_MANY = "not estimated: no coarse grid of this problem is small enough"
 UNSETTLED = "not estimated: the equation with linear ends has no solution near this one"
 
@@ -88,9 +90,9 @@ def reported(solution: Solution, found: BoxError) -> Solution:
     if found.error is not None:
         warn_of_box(found, np.asarray(solution.value), grid)
         return dataclasses.replace(solution, box_error=found.error)
-    solution.stats["box_error"] = found.reason
-    if found.reason in (TOO_MANY, UNSETTLED) and solution.cut is not None:
-        cut = np.max(np.reshape(solution.cut, (-1, grid.ndim, 2)), axis=0)
+    cut = np.zeros(0) if solution.cut is None else np.max(np.reshape(solution.cut, (-1, grid.ndim, 2)), axis=0)
+    solution.stats["box_error"] = UNMOVED if found.reason == NEVER_REACHED and np.any(cut) else found.reason
+    if found.reason in (TOO_MANY, UNSETTLED, FLAT) and np.any(cut):
         warn_of_cuts(cut, np.array([[grid.size // count] * 2 for count in grid.shape]), grid)
     return solution
 
@@ -132,6 +134,8 @@ def of_two_marches(first: np.ndarray, second: np.ndarray, coarse: Grid, value: N
       fine: the grid of the estimate.
     """
     change, scale = np.abs(second - first), np.ptp(value)
+    if _is_flat(np.asarray(value)):
+        return BoxError(None, FLAT)
     if np.max(change) <= ROUNDING * scale:
         return BoxError(None, NEVER_REACHED)
     error = np.stack([nested_grids.prolong(each, coarse, fine) for each in change])
@@ -182,7 +186,9 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     restricted, policy = _defect(level, jnp.asarray(before, level.tol.dtype))
     start, defect = jax.device_get((restricted, policy.defect))
     obstacles = _fixed_next_to_lost(level)
-    value, scale = start, np.ptp(start[np.asarray(level.counted)])
+    value, scale = start, np.ptp(counted := start[np.asarray(level.counted)])
+    if _is_flat(counted):
+        return BoxError(None, FLAT)
     moved = np.zeros(grid.shape, bool)
     for step in range(STEPS):
         source, weights, landings = jax.device_get(_equation(others, value, obstacles, defect))
@@ -225,6 +231,11 @@ def _equation(
     for offset, entry in zip(offsets, entries, strict=True):
         weights[offset] = weights[offset] + entry if offset in weights else entry
     return equation.source, weights, equation.weights.landings
+
+
+def _is_flat(value: np.ndarray) -> bool:
+    """True if V varies by rounding only."""
+    return bool(np.ptp(value) <= max(ROUNDING, 8 * np.finfo(value.dtype).eps) * np.max(np.abs(value)))
 
 
 def _fixed_next_to_lost(task: Task) -> Obstacles:

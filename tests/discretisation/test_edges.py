@@ -350,6 +350,7 @@ def test_growth_with_projected_ends_warns_and_says_where():
     with pytest.warns(hjb.SolveWarning, match=r"(?s)lower end of x1 \(1 of 1 nodes\).*edges='constrained'"):
         solution = hjb.solve(problem, hjb.Grid([1.5], [9.5], (201,)), tol=1e-6, scheme=hjb.Upwind())
     assert solution.cut.tolist() == [[1, 0]]
+    assert "V is constant" in solution.stats["box_error"]  # no other end changes it, though every path reaches the end
     assert "drift out of the box, nodes at the ends: x1 (1 lower" in str(solution)
 
 

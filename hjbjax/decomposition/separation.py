@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.types import Numbers
-from hjbjax.tracing.interpreter import evaluate_jaxpr, lift
+from hjbjax.tracing.interpreter import Algebra, evaluate_jaxpr, lift
 from hjbjax.tracing.jaxprs import array_type, bind
 from hjbjax.tracing.stacks import is_components, object_array
 
@@ -144,7 +144,7 @@ def _scaled(value: Separated, factor: Separated, operation: Callable) -> Separat
     return Separated({MAX: MIN, MIN: MAX}[value.kind] if flipped else value.kind, parts)
 
 
-class _Algebra:
+class _Separation(Algebra):
     """The algebra of separated scalars for ``evaluate_jaxpr``."""
 
     def constant(self, value: Numbers, index: tuple[int, ...]) -> Separated:
@@ -186,15 +186,6 @@ class _Algebra:
         number = operation(*(_number(each, dtype) for each in (left, right)))
         return Separated(ONE, {left.inputs | right.inputs: number})
 
-    def computes(self, eqn: jex.JaxprEqn) -> bool:
-        return False
-
-    def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
-        return None
-
-    def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
-        return self.nodewise(eqn, operands)
-
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
         used, arrays = NONE, []
         for value, var in zip(operands, eqn.invars, strict=True):
@@ -211,4 +202,4 @@ class _Algebra:
         ]
 
 
-_ALGEBRA = _Algebra()
+_ALGEBRA = _Separation()

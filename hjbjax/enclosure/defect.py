@@ -17,7 +17,7 @@ import itertools
 import numpy as np
 
 from hjbjax.enclosure.interpolant import SEAM, Cells, Ends, Spline
-from hjbjax.enclosure.minimum import Cell, outcome
+from hjbjax.enclosure.minimum import Cell, cell_defect
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing import intervals as iv
@@ -164,12 +164,12 @@ def over_part(
     boxes, centres, radii = cells.boxes(ends)
     w, p = cells.scalars(ends)
     n, every = len(boxes), frozenset(walls)
-    found = outcome(problem, Cell(tf.coordinates(boxes, centres, n), radii, w, p), [every] if walls else [])
+    found = cell_defect(problem, Cell(tf.coordinates(boxes, centres, n), radii, w, p), [every] if walls else [])
     low, high = found.defect.ends
     rises = np.ones(np.shape(low), bool)
     for axis, side in walls.items():
         slope = p[axis].bounds(radii)
-        outward, speed = (iv.choose(side > 0, each, -each) for each in (slope, found.drift[axis]))
+        outward, speed = (iv.where(side > 0, each, -each) for each in (slope, found.drift[axis]))
         rises &= outward.hi > 0
         loss = point(np.maximum(speed.hi, 0.0)) * point(np.maximum(-outward.lo, 0.0))
         low = (point(low) - loss).lo

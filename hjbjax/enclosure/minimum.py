@@ -45,7 +45,7 @@ class Cell:
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class CellDefect:
     """The defect over parts of cells.
 
     Attributes:
@@ -63,7 +63,7 @@ class Outcome:
     policy: np.ndarray
 
 
-def outcome(problem: Problem, cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> Outcome:
+def cell_defect(problem: Problem, cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
     """The defect of a candidate.
 
     Args:
@@ -77,7 +77,7 @@ def outcome(problem: Problem, cell: Cell, stopped: Sequence[frozenset[int]] = ()
     count = 0 if problem.controls is None else problem.controls.dim
     try:
         drift = qu.quadratics(problem.drift, cell.x, count)
-        cost: qu.Terms = {(): tf.constant(0.0)}
+        cost = qu.Polynomial({(): tf.constant(0.0)})
         if problem.cost is not None:
             cost = qu.quadratics(problem.cost, cell.x, count)[0]
         return _by_formula(problem, cell, rate, stopped, drift, cost)
@@ -86,21 +86,21 @@ def outcome(problem: Problem, cell: Cell, stopped: Sequence[frozenset[int]] = ()
 
 
 def _by_formula(
-    problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]], drift: list[qu.Terms],
-    cost: qu.Terms,
-) -> Outcome:  # fmt: skip
+    problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]], drift: list[qu.Polynomial],
+    cost: qu.Polynomial,
+) -> CellDefect:  # fmt: skip
     """By the minimum of a quadratic polynomial of the control."""
 
     def defect(without: frozenset[int]) -> tuple[Interval, Actions, list[np.ndarray]]:
         total = cost
         for i, (component, slope) in enumerate(zip(drift, cell.p, strict=True)):
             if i not in without:
-                total = qu.add(total, qu.multiply(component, {(): slope}))
+                total = total + component * qu.Polynomial({(): slope})
         least, actions, near = least_over(problem.controls, total)
-        return tf.subtract(tf.multiply(rate, cell.w), least).bounds(cell.radii), actions, near
+        return (rate * cell.w - least).bounds(cell.radii), actions, near
 
     found, actions, near = defect(frozenset())
-    return Outcome(
+    return CellDefect(
         found, rate.range, {each: defect(each)[0].hi for each in stopped},
         [range_over(component, actions) for component in drift], _stacked(near, cell),
     )  # fmt: skip
@@ -112,7 +112,7 @@ def _stacked(inputs: Sequence[np.ndarray], cell: Cell) -> np.ndarray:
     return np.stack(rows, axis=-1) if rows else np.zeros((*np.shape(cell.w.range.lo), 0))
 
 
-def range_over(terms: qu.Terms, actions: Actions) -> Interval:
+def range_over(terms: qu.Polynomial, actions: Actions) -> Interval:
     """The range of a polynomial over a box of controls and over cells."""
     total = point(0.0)
     for term, coefficient in terms.items():
@@ -126,7 +126,7 @@ def range_over(terms: qu.Terms, actions: Actions) -> Interval:
     return total
 
 
-def least_over(admissible: Any, terms: qu.Terms) -> tuple[Form, Actions, list[np.ndarray]]:
+def least_over(admissible: Any, terms: qu.Polynomial) -> tuple[Form, Actions, list[np.ndarray]]:
     """The minimum of a polynomial over a set, the ranges of the minimisers, and a minimiser at the centre.
 
     Raises:
@@ -146,24 +146,24 @@ def least_over(admissible: Any, terms: qu.Terms) -> tuple[Form, Actions, list[np
         actions, near = [], []
         for j in range(count):
             part, action, middle = least_quadratic(b[j], squares[j] or zero, lo[j], hi[j])
-            least = tf.add(least, part)
+            least = least + part
             actions.append(action)
             near.append(middle)
         return least, actions, near
     if isinstance(admissible, Ball):
         radius = float(admissible.radius)
         length = norm(b)
-        part, _, distance = least_quadratic(tf.negative(length), _common(squares), 0.0, radius)
+        part, _, distance = least_quadratic(-length, _common(squares), 0.0, radius)
         whole = Interval(np.array(-radius), np.array(radius))
         size = np.maximum(length.centre.hi, iv.TINY)
-        return tf.add(least, part), [whole] * count, [-distance * each.centre.lo / size for each in b]
+        return least + part, [whole] * count, [-distance * each.centre.lo / size for each in b]
     if isinstance(admissible, Simplex) and not any(squares):
         total = float(admissible.total)
         options = b + [zero] * admissible.at_most
         whole = Interval(np.array(0.0), np.array(total))
         best = np.argmin(np.stack(np.broadcast_arrays(*(each.centre.lo for each in options))), axis=0)
         near = [np.where(best == j, total, 0.0) for j in range(count)]
-        return tf.add(least, tf.multiply(tf.constant(total), tf.minimum(*options))), [whole] * count, near
+        return least + tf.constant(total) * tf.minimum(*options), [whole] * count, near
     raise qu.NotQuadraticError
 
 
@@ -185,7 +185,7 @@ def norm(b: Sequence[Form]) -> Form:
         total = iv.squared(ranges[0])
         for each in ranges[1:]:
             total = total + iv.squared(each)
-        return iv.root(Interval(np.maximum(total.lo, 0.0), total.hi))
+        return iv.square_root(Interval(np.maximum(total.lo, 0.0), total.hi))
 
     def derivatives(*ranges: Interval) -> list[Interval]:
         length = function(*ranges)
@@ -215,34 +215,34 @@ def least_quadratic(b: Form, c: Form, lo: float, hi: float) -> tuple[Form, Inter
     def function(slope: Interval, curvature: Interval) -> Interval:
         # concave in the slope and increasing in the curvature: least at ends of both
         low = [_lower_bound(end, curvature.lo, lo, hi) for end in slope.ends]
-        u = minimiser(slope, curvature, lo, hi)
+        u = minimisers(slope, curvature, lo, hi)
         tried = [each for each in (u.lo, u.hi, (u.lo + u.hi) / 2) if np.all(np.isfinite(each))]
         high = [(slope * point(u) + curvature * iv.squared(point(u))).hi for u in tried]
         most = np.minimum.reduce(high) if high else np.full(np.shape(low[0]), np.inf)
         return Interval(np.minimum(*low), most)
 
     def derivatives(slope: Interval, curvature: Interval) -> tuple[Interval, Interval]:
-        u = minimiser(slope, curvature, lo, hi)
+        u = minimisers(slope, curvature, lo, hi)
         return u, iv.squared(u)
 
     def seconds(slope: Interval, curvature: Interval) -> tf.Curvature:
-        u = minimiser(slope, curvature, lo, hi)
+        u = minimisers(slope, curvature, lo, hi)
         free = -(slope / curvature.scaled(2.0))
         inside, outside = (free.lo > lo) & (free.hi < hi), (u.lo == u.hi)
         zero = point(0.0)
         response = -(point(0.5) / curvature)  # of the minimiser to the slope, where it is inside
-        response = iv.choose(inside, response, iv.union(response, zero))
+        response = iv.where(inside, response, iv.union(response, zero))
         # without curvature the minimiser jumps from one end to the other
-        response = iv.choose(curvature.lo > 0, response, iv.entire(response))
-        response = iv.choose(outside & ~inside, zero, response)
+        response = iv.where(curvature.lo > 0, response, iv.entire(response))
+        response = iv.where(outside & ~inside, zero, response)
         return {(0, 0): response, (0, 1): (response * u).scaled(2.0), (1, 1): (response * iv.squared(u)).scaled(4.0)}
 
-    at_centre = minimiser(b.centre, c.centre, lo, hi)
+    at_centre = minimisers(b.centre, c.centre, lo, hi)
     middle = np.clip(np.nan_to_num((at_centre.lo + at_centre.hi) / 2), lo, hi)
-    return tf.apply(function, derivatives, seconds, b, c), minimiser(b.range, c.range, lo, hi), middle
+    return tf.apply(function, derivatives, seconds, b, c), minimisers(b.range, c.range, lo, hi), middle
 
 
-def minimiser(slope: Interval, curvature: Interval, lo: float, hi: float) -> Interval:
+def minimisers(slope: Interval, curvature: Interval, lo: float, hi: float) -> Interval:
     """All minimisers of b u + c u² over lo ≤ u ≤ hi."""
     low, high = point(np.asarray(lo)), point(np.asarray(hi))
     free = -(slope / curvature.scaled(2.0))
@@ -252,9 +252,9 @@ def minimiser(slope: Interval, curvature: Interval, lo: float, hi: float) -> Int
     at_low = (slope + two * curvature * low).lo >= 0 if np.isfinite(lo) else np.zeros((), bool)
     at_high = (slope + two * curvature * high).hi <= 0 if np.isfinite(hi) else np.zeros((), bool)
     convex = curvature.lo >= 0
-    found = iv.choose(curvature.lo > 0, inside, Interval(low.lo, high.lo))
-    found = iv.choose(convex & at_low, low, found)
-    return iv.choose(convex & at_high, high, found)
+    found = iv.where(curvature.lo > 0, inside, Interval(low.lo, high.lo))
+    found = iv.where(convex & at_low, low, found)
+    return iv.where(convex & at_high, high, found)
 
 
 def _lower_bound(slope: np.ndarray, curvature: np.ndarray, lo: float, hi: float) -> np.ndarray:
@@ -263,14 +263,14 @@ def _lower_bound(slope: np.ndarray, curvature: np.ndarray, lo: float, hi: float)
     ends = [(b * point(end) + c * iv.squared(point(end))).lo for end in (lo, hi)]
     with np.errstate(all="ignore"):
         free = (-(iv.squared(b) / (c.scaled(4.0)))).lo  # −b²/4c, the minimum over all u
-    u = minimiser(b, c, lo, hi)
+    u = minimisers(b, c, lo, hi)
     at_end = (u.hi <= lo) | (u.lo >= hi) | (curvature <= 0)
     least_end = np.minimum(*ends)
     # a convex polynomial whose minimiser is an end; a concave one is least at an end as well
     return np.where(at_end & np.isfinite(least_end), least_end, np.where(curvature > 0, free, -np.inf))
 
 
-def _enumerated(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]]) -> Outcome:
+def _enumerated(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]]) -> CellDefect:
     """By enumeration of a finite set."""
     costs: dict[frozenset[int], list[Form]] = {each: [] for each in (frozenset[int](), *stopped)}
     speeds: list[list[Interval]] = []
@@ -281,11 +281,11 @@ def _enumerated(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[froz
         for without, found in costs.items():
             found.append(_hamiltonian(paid, drift, cell.p, without))
         speeds.append([each.range for each in drift])
-    whole = tf.multiply(rate, cell.w)
+    whole = rate * cell.w
     points, gains = np.asarray(problem.controls.points, float), [each.centre.lo for each in costs[frozenset()]]
     best = np.argmin(np.stack(np.broadcast_arrays(*gains)), axis=0)
-    bounds = {without: tf.subtract(whole, tf.minimum(*found)).bounds(cell.radii) for without, found in costs.items()}
-    return Outcome(
+    bounds = {without: (whole - tf.minimum(*found)).bounds(cell.radii) for without, found in costs.items()}
+    return CellDefect(
         bounds[frozenset()], rate.range, {each: bounds[each].hi for each in stopped},
         [iv.union(*each) for each in zip(*speeds, strict=True)], points[best],
     )  # fmt: skip
@@ -299,13 +299,13 @@ def _hamiltonian(paid: Form, drift: Sequence[Form], p: Sequence[Form], without: 
     """L + f·p, without some components of the drift."""
     for i, (component, slope) in enumerate(zip(drift, p, strict=True)):
         if i not in without:
-            paid = tf.add(paid, tf.multiply(component, slope))
+            paid = paid + component * slope
     return paid
 
 
-def _by_pieces(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]]) -> Outcome:
+def _by_pieces(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]]) -> CellDefect:
     """By cutting the set into pieces: the control is one more coordinate of each box."""
-    n, whole = len(cell.x), tf.multiply(rate, cell.w)
+    n, whole = len(cell.x), rate * cell.w
     high = {each: np.asarray(-np.inf) for each in (frozenset[int](), *stopped)}
     low = np.asarray(-np.inf)
     policy = np.zeros((*np.shape(cell.w.range.lo), problem.controls.dim))
@@ -313,13 +313,13 @@ def _by_pieces(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[froze
     for box, centre, inside in pieces(problem.controls):
         radii = [
             *cell.radii,
-            *(np.nextafter((each.hi - each.lo) / 2 + iv.EPS * iv.size(each).hi, np.inf) for each in box),
+            *(np.nextafter((each.hi - each.lo) / 2 + iv.EPS * abs(each).hi, np.inf) for each in box),
         ]
         action = tf.coordinates(box, [point(c) for c in centre], n + len(box), n)
         drift = list(tf.taylor_forms(problem.drift, cell.x, action))
         paid = _running_cost(problem, cell.x, action)
         for without in high:
-            gain = tf.subtract(whole, _hamiltonian(paid, drift, cell.p, without))
+            gain = whole - _hamiltonian(paid, drift, cell.p, without)
             high[without] = np.maximum(high[without], gain.bounds(radii).hi)
             if not without and inside:  # the derivatives over the piece contain those at its centre
                 at_centre = dataclasses.replace(gain, range=iv.entire(gain.range))
@@ -328,7 +328,7 @@ def _by_pieces(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[froze
                 policy = np.where((found > low)[..., None], centre, policy)
                 low = np.maximum(low, found)
         speeds.append([each.range for each in drift])
-    return Outcome(
+    return CellDefect(
         Interval(low, high[frozenset()]), rate.range, {each: high[each] for each in stopped},
         [iv.union(*each) for each in zip(*speeds, strict=True)], policy,
     )  # fmt: skip

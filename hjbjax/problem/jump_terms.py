@@ -48,10 +48,10 @@ def with_mean_jump_costs(problem: Problem) -> Problem:
 
 def _function(value: Any) -> jax.tree_util.Partial:
     """A function, or a number as a function; None stands for zero."""
-    return value if callable(value) else jax.tree_util.Partial(constant, 0.0 if value is None else value)
+    return value if callable(value) else jax.tree_util.Partial(constant_function, 0.0 if value is None else value)
 
 
-def constant(value: Any, *arguments: Any) -> Any:
+def constant_function(value: Any, *arguments: Any) -> Any:
     """A constant as a function."""
     return value
 

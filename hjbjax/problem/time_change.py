@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from hjbjax.problem.jump_terms import constant
+from hjbjax.problem.jump_terms import constant_function
 from hjbjax.problem.problem import Problem, known_sign
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.types import Array, Number, State
@@ -46,7 +46,7 @@ def in_own_time(problem: Problem) -> Problem:
         return problem
     noise, rate = problem.noise, net_discount(problem)
     if noise is not None and not callable(noise):
-        noise = jax.tree_util.Partial(constant, noise)
+        noise = jax.tree_util.Partial(constant_function, noise)
     scaled = {
         "drift": _over(problem.drift, rate, 1),
         "noise": None if noise is None else _over(noise, rate, 2),
@@ -69,7 +69,7 @@ def net_discount(problem: Problem) -> jax.tree_util.Partial:
     """β(x) − g(x, u, d) as a function of the arguments of the drift, without the time."""
     discount, growth = problem.discount, problem.growth
     if not callable(discount):
-        discount = jax.tree_util.Partial(constant, discount)
+        discount = jax.tree_util.Partial(constant_function, discount)
     return _without_growth(discount) if growth is None else _less_growth(discount, growth)
 
 

@@ -22,7 +22,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import indices, stacks
-from hjbjax.tracing.interpreter import evaluate_jaxpr, lift, pack
+from hjbjax.tracing.interpreter import Algebra, evaluate_jaxpr, lift, pack
 from hjbjax.tracing.jaxprs import array_type, bind
 from hjbjax.tracing.stacks import is_components, object_array
 
@@ -83,7 +83,7 @@ def _trace(function: Callable, *arguments: Any, dtype: DType) -> tuple[jex.Close
     return closed, packed
 
 
-class _Arrays:
+class _Arrays(Algebra):
     """The algebra of arrays over the nodes; each array has the rank of the grid, or rank zero."""
 
     def constant(self, value: Any, index: tuple[int, ...]) -> Numbers:
@@ -99,9 +99,6 @@ class _Arrays:
 
     def combine(self, operation: Callable, dtype: np.dtype, left: Numbers, right: Numbers) -> jax.Array:
         return operation(*jnp.broadcast_arrays(jnp.asarray(left, dtype), jnp.asarray(right, dtype)))
-
-    def computes(self, eqn: jex.JaxprEqn) -> bool:
-        return False
 
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> list | None:
         return stacks.results(eqn, operands)

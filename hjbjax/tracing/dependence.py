@@ -22,7 +22,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import remembered
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing.interpreter import evaluate_jaxpr
+from hjbjax.tracing.interpreter import Algebra, evaluate_jaxpr
 from hjbjax.tracing.jaxprs import array_type
 from hjbjax.tracing.operations import NONE, Operations, operations
 from hjbjax.tracing.stacks import is_components
@@ -206,7 +206,7 @@ def _times(left: Term, right: Term) -> Term:
     return frozenset(left) | frozenset(right)
 
 
-class _Polynomials:
+class _Polynomials(Algebra):
     """Algebra of sets of terms without coefficients, so terms never cancel and "affine" holds for all numbers."""
 
     def constant(self, value: Numbers, index: tuple[int, ...]) -> Terms:
@@ -244,16 +244,6 @@ class _Polynomials:
         if operation is jax.lax.mul:
             return _product(left, right)
         return _some_function([left, right])
-
-    def computes(self, eqn: jex.JaxprEqn) -> bool:
-        return False
-
-    def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
-        return None  # sets of terms are stored per entry, and are cheap
-
-    def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
-        # the terms of ``inner`` do not count: the derivative rule may differ from the derivative of its computation
-        return self.nodewise(eqn, operands)
 
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
         varying = [v for v in operands if is_components(v)]

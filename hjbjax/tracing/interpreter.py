@@ -6,11 +6,12 @@ that act entry by entry, and sums and products. All others use the algebra's ``n
 
 from __future__ import annotations
 
+import abc
 import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -43,29 +44,36 @@ class FallbackWarning(UserWarning):
     """A primitive without a component rule is evaluated node by node with ``vmap``, which is correct but slower."""
 
 
-class Algebra(Protocol):
+class Algebra(abc.ABC):
     """Arithmetic of the scalars in an object array: arrays over the nodes, or sets of terms in the control."""
 
+    @abc.abstractmethod
     def constant(self, value: Numbers, index: tuple[int, ...]) -> Any:
         """The scalar for one entry of numbers that hold at all nodes."""
 
+    @abc.abstractmethod
     def entrywise(self, primitive: jex.Primitive, params: dict, operands: list, dtypes: Sequence[np.dtype]) -> Any:
         """One entry of the result of a primitive that acts entry by entry."""
 
+    @abc.abstractmethod
     def combine(self, operation: Callable, dtype: np.dtype, left: Any, right: Any) -> Any:
         """A sum, a product, a maximum ... of two scalars."""
 
+    @abc.abstractmethod
+    def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
+        """Results of an equation without a rule."""
+
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
-        """Results of a function with a custom derivative rule."""
+        """Results of a function with a custom derivative rule, which may differ from its computation ``inner``."""
+        return self.nodewise(eqn, operands)
 
     def computes(self, eqn: jex.JaxprEqn) -> bool:
         """True if the rules also apply to numbers that hold at all nodes, which JAX would round."""
+        return False
 
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> list | None:
         """Results of an equation on vectors too long for components; None if the component rules apply."""
-
-    def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
-        """Results of an equation without a rule."""
+        return None
 
 
 def pack(argument: Sequence[Numbers] | Numbers) -> np.ndarray:

@@ -58,6 +58,19 @@ class Interval:
         through = (other.lo <= 0) & (other.hi >= 0)
         return Interval(np.where(through, -np.inf, found.lo), np.where(through, np.inf, found.hi))
 
+    def __abs__(self) -> Interval:
+        far = np.maximum(np.abs(self.lo), np.abs(self.hi))
+        near = np.where((self.lo <= 0) & (self.hi >= 0), 0.0, np.minimum(np.abs(self.lo), np.abs(self.hi)))
+        return Interval(near, far)
+
+    def minimum(self, other: Interval) -> Interval:
+        """The smaller of two numbers."""
+        return Interval(np.minimum(self.lo, other.lo), np.minimum(self.hi, other.hi))
+
+    def maximum(self, other: Interval) -> Interval:
+        """The larger of two numbers."""
+        return Interval(np.maximum(self.lo, other.lo), np.maximum(self.hi, other.hi))
+
     def scaled(self, factor: float) -> Interval:
         """The product with a positive number."""
         return outward(self.lo * factor, self.hi * factor)
@@ -132,26 +145,9 @@ def meet(left: Interval, right: Interval) -> Interval:
     return Interval(np.maximum(left.lo, right.lo), np.minimum(left.hi, right.hi))
 
 
-def choose(which: np.ndarray, yes: Interval, no: Interval) -> Interval:
+def where(which: np.ndarray, yes: Interval, no: Interval) -> Interval:
     """One of two intervals, entry by entry."""
     return Interval(np.where(which, yes.lo, no.lo), np.where(which, yes.hi, no.hi))
-
-
-def least(left: Interval, right: Interval) -> Interval:
-    """The smaller of two numbers."""
-    return Interval(np.minimum(left.lo, right.lo), np.minimum(left.hi, right.hi))
-
-
-def largest(left: Interval, right: Interval) -> Interval:
-    """The larger of two numbers."""
-    return Interval(np.maximum(left.lo, right.lo), np.maximum(left.hi, right.hi))
-
-
-def size(x: Interval) -> Interval:
-    """|x|."""
-    far = np.maximum(np.abs(x.lo), np.abs(x.hi))
-    near = np.where((x.lo <= 0) & (x.hi >= 0), 0.0, np.minimum(np.abs(x.lo), np.abs(x.hi)))
-    return Interval(near, far)
 
 
 def squared(x: Interval) -> Interval:
@@ -165,7 +161,7 @@ def power(x: Interval, exponent: int) -> Interval:
         return point(1.0) / power(x, -exponent)
     if exponent == 0:
         return point(np.ones(np.shape(x.lo)))
-    base = size(x) if exponent % 2 == 0 else x
+    base = abs(x) if exponent % 2 == 0 else x
     # repeated multiplication rounds once per factor
     return _no_less(outward(base.lo**exponent, base.hi**exponent, exponent * LIBRARY), exponent % 2 == 0)
 
@@ -233,19 +229,19 @@ def tangent(x: Interval) -> Interval:
     slack = 1e-12 + 4 * EPS * np.maximum(np.abs(x.lo), np.abs(x.hi))
     pole = np.floor((x.hi + slack) / np.pi - 0.5) >= np.ceil((x.lo - slack) / np.pi - 0.5)
     pole |= ~(np.maximum(np.abs(x.lo), np.abs(x.hi)) < LARGE)
-    return choose(pole, entire(x), monotone(np.tan)(x))
+    return where(pole, entire(x), monotone(np.tan)(x))
 
 
 def hyperbolic_cosine(x: Interval) -> Interval:
     """cosh x."""
-    return monotone(np.cosh, least=1.0)(size(x))
+    return monotone(np.cosh, least=1.0)(abs(x))
 
 
 def angle(y: Interval, x: Interval) -> Interval:
     """atan2(y, x); the whole circle if the box may meet the half line where the angle jumps."""
     corners = [np.arctan2(b, a) for a in x.ends for b in y.ends]
     found = outward(np.minimum.reduce(corners), np.maximum.reduce(corners), LIBRARY)
-    return choose(meets_the_cut(y, x), outward(np.full_like(found.lo, -np.pi), np.full_like(found.lo, np.pi)), found)
+    return where(meets_the_cut(y, x), outward(np.full_like(found.lo, -np.pi), np.full_like(found.lo, np.pi)), found)
 
 
 def meets_the_cut(y: Interval, x: Interval) -> np.ndarray:
@@ -265,10 +261,10 @@ def general_power(x: Interval, y: Interval) -> Interval:
 def remainder(x: Interval, y: Interval) -> Interval:
     """The remainder of a division that rounds to zero; all remainders if the quotient is not the same everywhere."""
     whole = quotient(x, y)
-    bound = size(y).hi
+    bound = abs(y).hi
     every = Interval(np.where(x.lo < 0, -bound, 0.0), np.where(x.hi > 0, bound, 0.0))
     found = x - y * Interval(whole.lo, whole.lo)
-    return choose(whole.lo == whole.hi, meet(found, every), every)
+    return where(whole.lo == whole.hi, meet(found, every), every)
 
 
 def quotient(x: Interval, y: Interval) -> Interval:
@@ -291,14 +287,14 @@ def log_gamma(x: Interval) -> Interval:
     ends = [gammaln(end) for end in x.ends]
     found = outward(np.minimum(*ends), np.maximum(*ends), SPECIAL, SPECIAL)
     low = np.where((x.lo <= place) & (x.hi >= place), bottom - SPECIAL, found.lo)
-    return choose(x.lo > 0, Interval(low, found.hi), entire(x))
+    return where(x.lo > 0, Interval(low, found.hi), entire(x))
 
 
 def bessel_i0e(x: Interval) -> Interval:
     """exp(−|x|) I₀(x)."""
     from scipy.special import i0e
 
-    return monotone(i0e, falls=True, error=SPECIAL, least=0.0)(size(x))
+    return monotone(i0e, falls=True, error=SPECIAL, least=0.0)(abs(x))
 
 
 def bessel_i1e(x: Interval) -> Interval:
@@ -311,7 +307,7 @@ def bessel_i1e(x: Interval) -> Interval:
     return Interval(np.where((x.lo <= -1.5) & (x.hi >= -1.6), -LARGEST_OF_I1E, found.lo), high)
 
 
-def root(x: Interval) -> Interval:
+def square_root(x: Interval) -> Interval:
     """√x."""
     return monotone(np.sqrt, 0.0, least=0.0)(x)
 
@@ -345,7 +341,7 @@ def bell(x: Interval) -> Interval:
 
 def digamma(x: Interval) -> Interval:
     """The derivative of log Γ; all numbers where x may be ≤ 0."""
-    return choose(x.lo > 0, special("digamma", 1e-300)(x), entire(x))
+    return where(x.lo > 0, special("digamma", 1e-300)(x), entire(x))
 
 
 def trigamma(x: Interval) -> Interval:
@@ -353,7 +349,7 @@ def trigamma(x: Interval) -> Interval:
     from scipy.special import polygamma
 
     falls = monotone(lambda end: polygamma(1, end), 1e-300, falls=True, error=SPECIAL, least=0.0)
-    return choose(x.lo > 0, falls(x), entire(x))
+    return where(x.lo > 0, falls(x), entire(x))
 
 
 logarithm_of_two = outward(np.log(np.array(2.0)), np.log(np.array(2.0)))

@@ -17,6 +17,7 @@ not round.
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -27,8 +28,8 @@ from hjbjax.problem.pytree import as_partial, remembered
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Numbers
 from hjbjax.tracing import intervals as iv
-from hjbjax.tracing.interpreter import evaluate_jaxpr, lift, pack
-from hjbjax.tracing.intervals import Interval, entire, monotone, outward, point, power, size, squared, union
+from hjbjax.tracing.interpreter import Algebra, evaluate_jaxpr, lift, pack
+from hjbjax.tracing.intervals import Interval, entire, monotone, outward, point, power, squared, union
 from hjbjax.tracing.jaxprs import CALLS, CUMULATIVE, MOVES, REDUCTIONS, SCATTERS, array_type
 from hjbjax.tracing.stacks import varies
 
@@ -56,6 +57,30 @@ class Form:
     slopes: Slopes = ()
     gradient: Slopes = ()
     curvature: Curvature = dataclasses.field(default_factory=dict)
+
+    def __add__(self, other: Form) -> Form:
+        return _linear(operator.add, (1, 1), self, other)
+
+    def __sub__(self, other: Form) -> Form:
+        return _linear(operator.sub, (1, -1), self, other)
+
+    def __neg__(self) -> Form:
+        return _linear(operator.neg, (-1,), self)
+
+    def __mul__(self, other: Form) -> Form:
+        if self is other:  # narrower than the product of two unrelated factors
+            return powers(self, 2)
+        return apply(operator.mul, lambda a, b: (b, a), lambda a, b: {(0, 1): _ONE}, self, other)
+
+    def __truediv__(self, other: Form) -> Form:
+        if not other.slopes:
+            return self * Form(_ONE / other.range, _ONE / other.centre)
+        return apply(
+            operator.truediv,
+            lambda a, b: (_ONE / b, -(a / squared(b))),
+            lambda a, b: {(0, 1): -(_ONE / squared(b)), (1, 1): (a / power(b, 3)).scaled(2.0)},
+            self, other,
+        )  # fmt: skip
 
     def bounds(self, radii: Sequence[np.ndarray]) -> Interval:
         """The range by Taylor's theorem of first and of second order, over boxes with these half widths."""
@@ -227,40 +252,6 @@ def _linear(function: Callable[..., Interval], signs: Sequence[int], *operands: 
     )  # fmt: skip
 
 
-def add(left: Form, right: Form) -> Form:
-    """left + right."""
-    return _linear(lambda a, b: a + b, (1, 1), left, right)
-
-
-def subtract(left: Form, right: Form) -> Form:
-    """left − right."""
-    return _linear(lambda a, b: a - b, (1, -1), left, right)
-
-
-def negative(x: Form) -> Form:
-    """−x."""
-    return _linear(lambda a: -a, (-1,), x)
-
-
-def multiply(left: Form, right: Form) -> Form:
-    """left · right; a square if both are the same scalar."""
-    if left is right:
-        return powers(left, 2)
-    return apply(lambda a, b: a * b, lambda a, b: (b, a), lambda a, b: {(0, 1): _ONE}, left, right)
-
-
-def divide(left: Form, right: Form) -> Form:
-    """left / right."""
-    if not right.slopes:
-        return multiply(left, Form(_ONE / right.range, _ONE / right.centre))
-    return apply(
-        lambda a, b: a / b,
-        lambda a, b: (_ONE / b, -(a / squared(b))),
-        lambda a, b: {(0, 1): -(_ONE / squared(b)), (1, 1): (a / power(b, 3)).scaled(2.0)},
-        left, right,
-    )  # fmt: skip
-
-
 def powers(x: Form, exponent: int) -> Form:
     """x^k for an integer k."""
     if exponent == 1:
@@ -278,13 +269,13 @@ def minimum(*parts: Form) -> Form:
     """The smallest of several scalars."""
     found = parts[0]
     for part in parts[1:]:
-        found = apply(iv.least, lambda a, b: _weights(a.hi <= b.lo, b.hi <= a.lo), _kink_of_two, found, part)
+        found = apply(Interval.minimum, lambda a, b: _weights(a.hi <= b.lo, b.hi <= a.lo), _kink_of_two, found, part)
     return found
 
 
 def maximum(left: Form, right: Form) -> Form:
     """The larger of two scalars."""
-    return apply(iv.largest, lambda a, b: _weights(a.lo >= b.hi, b.lo >= a.hi), _kink_of_two, left, right)
+    return apply(Interval.maximum, lambda a, b: _weights(a.lo >= b.hi, b.lo >= a.hi), _kink_of_two, left, right)
 
 
 def _weights(first: np.ndarray, second: np.ndarray) -> tuple[Interval, Interval]:
@@ -316,7 +307,7 @@ def _kink(x: Interval) -> Interval:
 
 
 def _reciprocal_root(x: Interval) -> Interval:
-    return _ONE / iv.root(x)
+    return _ONE / iv.square_root(x)
 
 
 _ONE = point(1.0)
@@ -329,10 +320,10 @@ Derivative = Callable[[Interval, Interval], Interval]
 # range, derivative and second derivative of the functions of one number x; derivatives also take the result y
 SMOOTH: dict[str, tuple[Callable[[Interval], Interval], Derivative, Derivative]] = {
     "neg": (lambda x: -x, lambda x, y: -_ONE, lambda x, y: _NO_BEND),
-    "abs": (size, lambda x, y: _signs(x), lambda x, y: _kink(x)),
+    "abs": (abs, lambda x, y: _signs(x), lambda x, y: _kink(x)),
     "square": (squared, lambda x, y: x.scaled(2.0), lambda x, y: point(2.0)),
     "one_minus_square": (lambda x: _ONE - squared(x), lambda x, y: -x.scaled(2.0), lambda x, y: point(-2.0)),
-    "sqrt": (iv.root, lambda x, y: point(0.5) / y, lambda x, y: point(-0.25) / (y * x)),
+    "sqrt": (iv.square_root, lambda x, y: point(0.5) / y, lambda x, y: point(-0.25) / (y * x)),
     "rsqrt": (_reciprocal_root, lambda x, y: point(-0.5) * power(y, 3), lambda x, y: point(0.75) * power(y, 5)),
     "cbrt": (
         monotone(np.cbrt), lambda x, y: _ONE / squared(y).scaled(3.0),
@@ -352,12 +343,12 @@ SMOOTH: dict[str, tuple[Callable[[Interval], Interval], Derivative, Derivative]]
     "cos": (iv.cosine, lambda x, y: -iv.sine(x), lambda x, y: -y),
     "tan": (iv.tangent, lambda x, y: _ONE + squared(y), lambda x, y: (y * (_ONE + squared(y))).scaled(2.0)),
     "asin": (
-        monotone(np.arcsin, -1.0, 1.0), lambda x, y: _ONE / iv.root(_ONE - squared(x)),
-        lambda x, y: x / power(iv.root(_ONE - squared(x)), 3),
+        monotone(np.arcsin, -1.0, 1.0), lambda x, y: _ONE / iv.square_root(_ONE - squared(x)),
+        lambda x, y: x / power(iv.square_root(_ONE - squared(x)), 3),
     ),
     "acos": (
-        monotone(np.arccos, -1.0, 1.0, falls=True), lambda x, y: -(_ONE / iv.root(_ONE - squared(x))),
-        lambda x, y: -(x / power(iv.root(_ONE - squared(x)), 3)),
+        monotone(np.arccos, -1.0, 1.0, falls=True), lambda x, y: -(_ONE / iv.square_root(_ONE - squared(x))),
+        lambda x, y: -(x / power(iv.square_root(_ONE - squared(x)), 3)),
     ),
     "atan": (
         monotone(np.arctan), lambda x, y: _ONE / (_ONE + squared(x)),
@@ -370,12 +361,12 @@ SMOOTH: dict[str, tuple[Callable[[Interval], Interval], Derivative, Derivative]]
         lambda x, y: -(y * (_ONE - squared(y))).scaled(2.0),
     ),
     "asinh": (
-        monotone(np.arcsinh), lambda x, y: _ONE / iv.root(_ONE + squared(x)),
-        lambda x, y: -(x / power(iv.root(_ONE + squared(x)), 3)),
+        monotone(np.arcsinh), lambda x, y: _ONE / iv.square_root(_ONE + squared(x)),
+        lambda x, y: -(x / power(iv.square_root(_ONE + squared(x)), 3)),
     ),
     "acosh": (
-        monotone(np.arccosh, 1.0, least=0.0), lambda x, y: _ONE / iv.root(squared(x) - _ONE),
-        lambda x, y: -(x / power(iv.root(squared(x) - _ONE), 3)),
+        monotone(np.arccosh, 1.0, least=0.0), lambda x, y: _ONE / iv.square_root(squared(x) - _ONE),
+        lambda x, y: -(x / power(iv.square_root(squared(x) - _ONE), 3)),
     ),
     "atanh": (
         monotone(np.arctanh, -1.0, 1.0), lambda x, y: _ONE / (_ONE - squared(x)),
@@ -405,7 +396,8 @@ STEPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {  # constant between jum
 }  # fmt: skip
 SAME = frozenset({"copy", "copy_p", "real", "stop_gradient"})
 BINARY: dict[str, Callable[[Form, Form], Form]] = {
-    "add": add, "add_any": add, "sub": subtract, "mul": multiply, "div": divide, "min": minimum, "max": maximum,
+    "add": operator.add, "add_any": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv,
+    "min": minimum, "max": maximum,
 }  # fmt: skip
 COMPARISONS: dict[str, Callable[[Interval, Interval], Interval]] = {
     "lt": lambda a, b: Interval(a.hi < b.lo, a.lo < b.hi),
@@ -419,7 +411,8 @@ COMPARISONS: dict[str, Callable[[Interval, Interval], Interval]] = {
     "xor": lambda a, b: Interval((a.lo & ~b.hi) | (~a.hi & b.lo), (a.hi & ~b.lo) | (~a.lo & b.hi)),
 }
 COMBINED: dict[Callable, Callable[[Form, Form], Form]] = {
-    jax.lax.add: add, jax.lax.sub: subtract, jax.lax.mul: multiply, jax.lax.min: minimum, jax.lax.max: maximum,
+    jax.lax.add: operator.add, jax.lax.sub: operator.sub, jax.lax.mul: operator.mul, jax.lax.min: minimum,
+    jax.lax.max: maximum,
 }  # fmt: skip
 
 
@@ -520,7 +513,7 @@ def _remainder(x: Form, y: Form) -> Form:
     def derivatives(a: Interval, b: Interval) -> tuple[Interval, Interval]:
         one = iv.is_one_quotient(a, b)
         whole = entire(Interval(one, one))
-        return iv.choose(one, _ONE, whole), iv.choose(one, -iv.quotient(a, b), whole)
+        return iv.where(one, _ONE, whole), iv.where(one, -iv.quotient(a, b), whole)
 
     def seconds(a: Interval, b: Interval) -> Curvature:
         jump = _unknown(~iv.is_one_quotient(a, b))
@@ -535,7 +528,7 @@ def _general_power(x: Form, y: Form) -> Form:
     if not y.slopes and np.size(exponent.lo) == 1 and exponent.lo == np.round(exponent.lo) == exponent.hi:
         return powers(x, int(exponent.lo))
     if y.slopes:
-        return smooth("exp", multiply(y, smooth("log", x)))
+        return _smooth("exp", y * _smooth("log", x))
 
     def term(a: Interval, k: int) -> Interval:
         """The k-th derivative for the same exponent everywhere."""
@@ -547,7 +540,7 @@ def _general_power(x: Form, y: Form) -> Form:
     return apply(lambda a: term(a, 0), lambda a: (term(a, 1),), lambda a: {(0, 0): term(a, 2)}, x)
 
 
-def smooth(name: str, x: Form) -> Form:
+def _smooth(name: str, x: Form) -> Form:
     """A function of one number, by the name of its primitive."""
     function, derivative, second = SMOOTH[name]
     return apply(function, lambda a: (derivative(a, function(a)),), lambda a: {(0, 0): second(a, function(a))}, x)
@@ -562,18 +555,18 @@ def _angle(y: Form, x: Form) -> Form:
 
     def derivatives(b: Interval, a: Interval) -> tuple[Interval, Interval]:
         square, cut, whole = parts(b, a)
-        return iv.choose(cut, whole, a / square), iv.choose(cut, whole, -(b / square))
+        return iv.where(cut, whole, a / square), iv.where(cut, whole, -(b / square))
 
     def seconds(b: Interval, a: Interval) -> Curvature:
         square, cut, whole = parts(b, a)
         mixed, product = (squared(b) - squared(a)) / squared(square), (a * b).scaled(2.0) / squared(square)
         found = {(0, 0): -product, (0, 1): mixed, (1, 1): product}
-        return {place: iv.choose(cut, whole, each) for place, each in found.items()}
+        return {place: iv.where(cut, whole, each) for place, each in found.items()}
 
     return apply(iv.angle, derivatives, seconds, y, x)
 
 
-class _Scalars:
+class _Scalars(Algebra):
     """The algebra of scalars over boxes; refuses primitives without a rule."""
 
     def constant(self, value: Any, index: tuple[int, ...]) -> Form:
@@ -586,9 +579,9 @@ class _Scalars:
         if name in SAME:
             return x
         if name in SMOOTH:
-            return smooth(name, x)
+            return _smooth(name, x)
         if name == "div" and not np.issubdtype(dtypes[0], np.floating):
-            raise refusal("an integer division")
+            raise _refusal("an integer division")
         if name in BINARY:
             return BINARY[name](*operands)
         if name in COMPARISONS and all(each.range.lo.dtype == bool for each in operands) >= (name in LOGICAL):
@@ -598,14 +591,14 @@ class _Scalars:
             return jumping(lambda a: Interval(step(a.lo), step(a.hi)), x)
         other = OTHERS.get(name)
         if other is None or (name == "not" and x.range.lo.dtype != bool):
-            raise refusal(name)
+            raise _refusal(name)
         return other(operands, params)
 
     def combine(self, operation: Callable, dtype: np.dtype, left: Form, right: Form) -> Form:
         if operation in LOGICAL_REDUCTIONS and dtype.kind == "b":
             return jumping(COMPARISONS[LOGICAL_REDUCTIONS[operation]], left, right)
         if operation not in COMBINED:
-            raise refusal(getattr(operation, "__name__", str(operation)))
+            raise _refusal(getattr(operation, "__name__", str(operation)))
         return COMBINED[operation](left, right)
 
     def computes(self, eqn: jex.JaxprEqn) -> bool:
@@ -614,28 +607,28 @@ class _Scalars:
         if name in MOVES or not any(np.issubdtype(array_type(var).dtype, np.floating) for var in eqn.outvars):
             return False
         if not (name in KNOWN or name in CALLS or name == "cond" or name == "iota"):
-            raise refusal(name)
+            raise _refusal(name)
         return name != "iota"
 
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
-        """Refuse an equation without a rule, before the interpreter warns of a slow evaluation."""
+        """Refuse an equation without a rule before the interpreter warns of a slow evaluation."""
         name = eqn.primitive.name
         if name not in KNOWN and name not in MOVES:
-            raise refusal(name)
+            raise _refusal(name)
         if name in MOVES or name in SCATTERS:
             moved = MOVES[name](len(operands)) if name in MOVES else (0, 2)
             if any(varies(value) for k, value in enumerate(operands) if k not in moved):
-                raise refusal(f"{name} with an index that depends on the state")
+                raise _refusal(f"{name} with an index that depends on the state")
 
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list:
         # the derivatives are those of the computation: a rule of the user may differ
         return evaluate_jaxpr(inner, operands, self)
 
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
-        raise refusal(eqn.primitive.name)
+        raise _refusal(eqn.primitive.name)
 
 
-def refusal(name: str) -> ValueError:
+def _refusal(name: str) -> ValueError:
     """The error for a primitive without a rule."""
     return ValueError(
         f"enclose: a function of the problem uses {name}, for which there is no interval rule. Write it with\n"

@@ -63,7 +63,7 @@ def solver(
     return solve
 
 
-def widened(excess: np.ndarray, grid: Grid) -> np.ndarray:
+def smooth_cover(excess: np.ndarray, grid: Grid) -> np.ndarray:
     """A smooth source that is nowhere smaller than the excess: the mean over neighbours of the largest neighbour."""
     from scipy.ndimage import maximum_filter1d, uniform_filter1d
 

@@ -61,7 +61,9 @@ def defects(problem: Problem, grid: Grid, candidate: Spline, depth: int = 0) -> 
     return found
 
 
-def refine(problem: Problem, grid: Grid, candidate: Spline, found: Defects, chosen: np.ndarray, depth: int) -> Defects:
+def refine_cells(
+    problem: Problem, grid: Grid, candidate: Spline, found: Defects, chosen: np.ndarray, depth: int
+) -> Defects:
     """The defects, with some cells cut into 2^depth parts along every axis.
 
     Args:

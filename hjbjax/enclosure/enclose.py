@@ -85,7 +85,7 @@ def enclose(
     own, value, grid = _checked(problem, solution)
     arguments.positive(tol, "enclose: tol")
     count = arguments.count(rounds, "enclose: rounds")
-    needed = memory.fitting(peak_bytes(own, grid), grid, max_memory)
+    needed = memory.fitting(_peak_bytes(own, grid), grid, max_memory)
     scale = float(np.ptp(value)) or 1.0
     with own_settings(x64=True):
         task = _Task(own, grid, tuple(axis_table(grid, axis) for axis in range(grid.ndim)), scale * tol)
@@ -287,7 +287,7 @@ class _Task:
         One follows the paths. The other is a bump at the nodes themselves: at a kink that paths leave, the spline has
         an extremum, where the motion does not count and W must be the value of resting there.
         """
-        moves = [self.move(found, correction.widened(excess, self.grid)), excess]
+        moves = [self.move(found, correction.smooth_cover(excess, self.grid)), excess]
         options = [values - sign * move for move in moves]
         after = [self.defects(each) for each in options]
 
@@ -308,7 +308,7 @@ class _Task:
             chosen &= found.high - found.low > 0.2 * np.abs(sizes)
             if not np.any(chosen):
                 break
-            found = defect.refine(self.problem, self.grid, Spline(self.tables, values), found, chosen, depth)
+            found = defect.refine_cells(self.problem, self.grid, Spline(self.tables, values), found, chosen, depth)
         return found
 
 
@@ -351,7 +351,7 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
     return known, value, grid
 
 
-def peak_bytes(problem: Problem, grid: Grid) -> int:
+def _peak_bytes(problem: Problem, grid: Grid) -> int:
     """Bytes that ``enclose`` uses at its peak: all scalars of one block of cells, and the factors of the chain."""
     n, m = grid.ndim, 0 if problem.controls is None else problem.controls.dim
     arguments = ([0.0] * n, [0.0] * m)

@@ -149,7 +149,7 @@ def solve(
         admissible.
       SolveError: Ctrl-C or the time limit before the training began.
     """
-    corners = ingredients.corners(lo, hi, NAME)
+    corners = ingredients.box_corners(lo, hi, NAME)
     counts = [arguments.count(each, f"{NAME}: {name}") for each, name in ((steps, "steps"), (batch, "batch"))]
     for number, name in ((extremals, "extremals"), (held_out, "held_out")):
         arguments.count(number, f"{NAME}: {name}", least=0)

@@ -72,7 +72,7 @@ def state(value: object, label: str) -> np.ndarray:
     return array
 
 
-def corners(lo: object, hi: object, name: str) -> tuple[np.ndarray, np.ndarray]:
+def box_corners(lo: object, hi: object, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The corners of a box, after checks."""
     low, high = state(lo, f"{name}: lo"), state(hi, f"{name}: hi")
     if low.shape != high.shape or np.any(low >= high):

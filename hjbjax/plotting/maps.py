@@ -11,7 +11,7 @@ import numpy as np
 from hjbjax.plotting.histories import controls
 from hjbjax.plotting.modes import by_mode
 from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks, time_label
-from hjbjax.plotting.shading import Look, draw, fill_missing, frame, is_level, jumps, stopped
+from hjbjax.plotting.shading import Look, dot_region, draw, fill_missing, frame, is_level, jumps
 from hjbjax.plotting.slices import (
     Cuts,
     Region,
@@ -106,7 +106,7 @@ def value(
 def _stopped(ax: Axes, solution: Solution, section: Section, time: float | None) -> list[Artist]:
     """Draw the stopping set and the push region of the solution, if there are any."""
     found = decided_sets(solution, section, time)
-    return [artist for name, each in found.items() for artist in stopped(ax, section, *each, name)]
+    return [artist for name, each in found.items() for artist in dot_region(ax, section, *each, name)]
 
 
 def _without(section: Section, target: Callable[[State], Number] | None) -> tuple[Section, tuple[Region, ...]]:

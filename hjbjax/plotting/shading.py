@@ -191,7 +191,7 @@ def outlined(ax: Axes, region: Region, *, inside: bool = True) -> list[Artist]:
     return artists
 
 
-def stopped(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray, name: str) -> list[Artist]:
+def dot_region(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray, name: str) -> list[Artist]:
     """Dot the part of a section where it is optimal to stop or push, up to the free boundary, and name it.
 
     Args:

@@ -76,6 +76,11 @@ class BlockSolution:
         return self.parts[0].times
 
     @property
+    def timed(self) -> bool:
+        """True after ``march``, with methods that take (t, x) instead of (x)."""
+        return self.times is not None
+
+    @property
     def error(self) -> float | None:
         """The certified bound on the distance to the solutions of the discrete problems; ``None`` without one."""
         found = [part.error for part in self.parts]

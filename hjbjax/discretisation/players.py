@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex
+from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex, is_unbounded
 from hjbjax.tracing import dependence
 from hjbjax.tracing.operations import Operations
 
@@ -173,7 +173,7 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     # then the rate of leaving a node is convex
     affine = drift.affine_in(inputs) and found.switching.affine_in(inputs) and noise.free_of(inputs)
     # without bounds there are no ends, and the fastest action is known only once it has been chosen
-    at_ends = (affine and not getattr(admissible, "unbounded", False)) or isinstance(admissible, (Finite, type(None)))
+    at_ends = (affine and not is_unbounded(admissible)) or isinstance(admissible, (Finite, type(None)))
     suits = affine and found.landing.free_of(inputs)
     suits &= cost.quadratic_in(inputs) and isinstance(admissible, (Box, Ball, Simplex))
     products = frozenset(tuple(j - inputs.start for j in pair) for pair in cost.products_in(inputs))

@@ -337,7 +337,7 @@ def over_checked_modes(problem: Problem, n: int) -> Problem:
     sizes = {
         "x": (n,),
         "u": (one.controls.dim if one.controls else 0,),
-        "d": (getattr(problem.disturbances, "dim", 0),),
+        "d": (problem.disturbances.dim if problem.disturbances else 0,),
     }
     letters = {"rates": problem.arguments("x", "u", "d", "t"), "switching_cost": problem.state_arguments("x", "t")}
     for name, names in letters.items():

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Ball, Box, Finite, Simplex, extremes
+from hjbjax.problem.sets import Ball, Box, Finite, Simplex, is_unbounded, ranges
 from hjbjax.tracing import intervals as iv
 from hjbjax.tracing import quadratics as qu
 from hjbjax.tracing import taylor_forms as tf
@@ -341,13 +341,12 @@ def pieces(admissible: Any) -> list[tuple[list[Interval], np.ndarray, bool]]:
       ValueError: the set has too many inputs, or no boxes cover it.
     """
     count = admissible.dim
-    if count not in PIECES or isinstance(admissible, Simplex) or getattr(admissible, "unbounded", False):
+    if count not in PIECES or isinstance(admissible, Simplex) or is_unbounded(admissible):
         raise ValueError(
             f"enclose: got controls={admissible!r:.80} with a drift or a cost that is not a quadratic polynomial of\n"
             "single inputs; wanted such a polynomial, or a bounded Box or Ball of at most three inputs, or a Finite set"
         )
-    corners = np.asarray(extremes(admissible), float)
-    lo, hi = corners.min(axis=0), corners.max(axis=0)
+    lo, hi = ranges(admissible)
     steps = PIECES[count]
     edges = [(lo * (steps - k) + hi * k) / steps for k in range(steps + 1)]
     edges[0], edges[-1] = lo, hi

@@ -13,7 +13,7 @@ import numpy as np
 from hjbjax.enclosure.interpolant import Spline
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import extremes
+from hjbjax.problem.sets import ranges
 from hjbjax.tracing import taylor_forms as tf
 from hjbjax.tracing.intervals import Interval, quietly
 from hjbjax.tracing.taylor_forms import Form
@@ -58,10 +58,5 @@ def _any_action(admissible: Any) -> list[Form]:
     """Every input of the control as one interval."""
     if admissible is None:
         return []
-    if getattr(admissible, "unbounded", False):
-        ends = zip(np.asarray(admissible.lo, float), np.asarray(admissible.hi, float), strict=True)
-    else:
-        corners = np.asarray(extremes(admissible), float)
-        ends = zip(corners.min(axis=0), corners.max(axis=0), strict=True)
-    ranges = [Interval(np.asarray(lo), np.asarray(hi)) for lo, hi in ends]
-    return [Form(each, each) for each in ranges]
+    inputs = [Interval(np.asarray(lo), np.asarray(hi)) for lo, hi in zip(*ranges(admissible), strict=True)]
+    return [Form(each, each) for each in inputs]

@@ -1,7 +1,7 @@
 """The minimiser of the Hamiltonian with the costate of a solution that has no grid: ``costate_feedback``."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,32 @@ from hjbjax.tracing import checks, closures
 from hjbjax.tracing.dependence import influence
 
 
+@runtime_checkable
+class GridFreeFeedback(Protocol):
+    """A feedback without a grid that reports whether it depends on time."""
+
+    @property
+    def timed(self) -> bool:
+        """True if the methods take (t, x) instead of (x)."""
+
+    @property
+    def control_at(self) -> Callable[..., Array]:
+        """The control, shape (..., m)."""
+
+
+@runtime_checkable
+class GridFreeSolution(GridFreeFeedback, Protocol):
+    """A value without a grid: a HopfSolution, a NeuralSolution or a BlockSolution."""
+
+    @property
+    def ndim(self) -> int:
+        """The number of states n."""
+
+    @property
+    def costate_at(self) -> Callable[..., Array]:
+        """DV, shape (..., n)."""
+
+
 @pytree_dataclass(static=("rule", "timed"))
 class CostateFeedback:
     """u = argmin [L + f·DV] with DV from a solution without a grid; called with (x), or (t, x) if V depends on time.
@@ -29,19 +55,9 @@ class CostateFeedback:
     """
 
     problem: Problem
-    solution: Any
+    solution: GridFreeSolution
     rule: Rule
     timed: bool
-
-    @property
-    def horizon(self) -> Any:
-        """T; ``None`` for a stationary solution."""
-        return getattr(self.solution, "horizon", None)
-
-    @property
-    def times(self) -> Any:
-        """The stored times of a march; ``None`` without."""
-        return getattr(self.solution, "times", None)
 
     def __call__(self, *where: Numbers | Sequence) -> Any:
         """The control, as ``control_at``."""
@@ -73,7 +89,7 @@ def _minimisers(feedback: CostateFeedback, t: Array, x: Array, costate: Array) -
 _compiled = jax.jit(_minimisers)
 
 
-def costate_feedback(problem: Problem, solution: Any) -> CostateFeedback:
+def costate_feedback(problem: Problem, solution: GridFreeSolution) -> CostateFeedback:
     """The feedback of a solution without a grid, after checks of the problem.
 
     Raises:
@@ -93,9 +109,4 @@ def costate_feedback(problem: Problem, solution: Any) -> CostateFeedback:
         if not influence(problem, n, np.dtype(np.float64)).noise.is_constant:
             raise ValueError(f"{name}: the noise depends on the control, and a solution without a grid has no D²V")
         rule = pointwise.rule_of(problem, n)
-    return CostateFeedback(problem, solution, rule, takes_time(solution))
-
-
-def takes_time(solution: Any) -> bool:
-    """True if a solution without a grid, or its feedback, takes (t, x)."""
-    return getattr(solution, "horizon", None) is not None or getattr(solution, "times", None) is not None
+    return CostateFeedback(problem, solution, rule, solution.timed)

@@ -22,7 +22,7 @@ from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.posing import for_solvers
 from hjbjax.discretisation.schemes import Limited
 from hjbjax.discretisation.stencil import Links
-from hjbjax.feedback.costate_feedback import costate_feedback, takes_time
+from hjbjax.feedback.costate_feedback import CostateFeedback, GridFreeFeedback, GridFreeSolution, costate_feedback
 from hjbjax.hamiltonian.discrete import DiscreteHamiltonian
 from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.problem.grid import Grid
@@ -87,9 +87,9 @@ def without_grid(feedback: Any, time_varying: bool) -> tuple[Any, bool]:
 
     Other feedbacks are returned unchanged.
     """
-    if not hasattr(feedback, "control_at") or hasattr(feedback, "grid"):
+    if not isinstance(feedback, GridFreeFeedback):
         return feedback, time_varying
-    return feedback.control_at, time_varying or takes_time(feedback)
+    return feedback.control_at, time_varying or feedback.timed
 
 
 def check_kept(solution: GridFeedback, duration: float, name: str) -> float:
@@ -243,7 +243,7 @@ class GreedyFeedback:
 
 
 @front_door
-def greedy_feedback(problem: Problem, solution: Any) -> Any:
+def greedy_feedback(problem: Problem, solution: Solution | GridFreeSolution) -> "GreedyFeedback | CostateFeedback":
     """A feedback that minimises the Hamiltonian at the state, with the slopes of the solution's value there.
 
     u(x) = argmin_u max_d [L + f·DV + ½ tr(σσᵀ D²V)], exact where ``solve`` minimises exactly, and always admissible.
@@ -282,7 +282,7 @@ def greedy_feedback(problem: Problem, solution: Any) -> Any:
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"greedy_feedback: got {type(problem).__name__}, wanted a Problem")
-    if hasattr(solution, "costate_at") and not hasattr(solution, "grid"):
+    if isinstance(solution, GridFreeSolution):
         return costate_feedback(problem, solution)
     if not isinstance(solution, Solution):
         raise TypeError(f"greedy_feedback: got {type(solution).__name__}, wanted a Solution")

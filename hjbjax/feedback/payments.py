@@ -12,7 +12,7 @@ which is the value of a tube along the path. A path need not end at that moment.
 
 import contextlib
 import math
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -64,12 +64,21 @@ class Lookup:
         return query(between, samples, x, when, clamp=True, name="simulate")
 
 
+@runtime_checkable
+class MadeFromSolution(Protocol):
+    """A feedback that keeps the solution from which it was made, such as ``greedy_feedback``."""
+
+    @property
+    def solution(self) -> object:
+        """The solution."""
+
+
 def solution_of(feedback: object) -> Solution | None:
     """The Solution of a feedback: the feedback itself, or the Solution from which it was made; otherwise None.
 
     Its value is a cost, like everything in this file.
     """
-    solution = feedback if isinstance(feedback, Solution) else getattr(feedback, "solution", None)
+    solution = feedback.solution if isinstance(feedback, MadeFromSolution) else feedback
     return in_costs(solution) if isinstance(solution, Solution) else None
 
 

@@ -209,13 +209,12 @@ def _check_start(loop: Loop, start: np.ndarray) -> None:
     )
 
 
-def _is_traced(problem: object, *others: Any) -> bool:
+def _is_traced(problem: Problem, *others: Any) -> bool:
     """True if some number is a tracer, including the numbers that functions close over."""
     names = (*OF_ACTION, *OF_STATE, *RATES)
-    modes = getattr(problem, "modes", None)
-    tables = [] if modes is None else [modes.rates, modes.switching_cost]
-    functions = [getattr(problem, name, None) for name in names]
-    paid = [each for push in getattr(problem, "pushes", ()) for each in (push.cost, push.reward)]
+    tables = [] if problem.modes is None else [problem.modes.rates, problem.modes.switching_cost]
+    functions = [getattr(problem, name) for name in names]
+    paid = [each for push in problem.pushes for each in (push.cost, push.reward)]
     functions += [each for each in (*tables, *paid, *others) if callable(each)]
     return is_traced(problem, *others) or any(map(holds_tracers, functions))
 

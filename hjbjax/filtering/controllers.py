@@ -178,7 +178,7 @@ def certainty_equivalence(observer: Observer, feedback: GridFeedback | Callable)
       -1.0
     """
     name = "certainty_equivalence"
-    if not callable(getattr(observer, "estimate", None)):
+    if not isinstance(observer, Observer):
         raise TypeError(f"{name}: got {type(observer).__name__}, wanted an Observer, with estimate(state)")
     return jax.tree_util.Partial(_at_estimate, as_partial(observer.estimate), _stationary(feedback, name))
 

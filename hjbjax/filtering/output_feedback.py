@@ -13,6 +13,8 @@ from hjbjax.feedback.path import PathStatus
 from hjbjax.filtering.measurement import Measurement, measurement
 from hjbjax.filtering.output_loop import (
     CertaintyEquivalence,
+    GridObserver,
+    Judge,
     Observer,
     OutputLoop,
     OutputPath,
@@ -115,8 +117,8 @@ def simulate_output(
         path = _jit_paths(loop, start, times, keys, substeps)
         path = jax.tree.map(np.asarray, path)
     _report(path)
-    if callable(judge := getattr(control, "judge", None)):
-        judge(path)
+    if isinstance(control, Judge):
+        control.judge(path)
     return path
 
 
@@ -215,7 +217,8 @@ def _box(grid: Grid | None, control: Any, observer: Observer, n: int) -> Grid | 
     """The grid that defines the periodic states: the argument, or the grid of the feedback or the observer."""
     if grid is None and is_grid_feedback(control):
         grid = control.grid
-    grid = getattr(observer, "grid", None) if grid is None else grid
+    if grid is None and isinstance(observer, GridObserver):
+        grid = observer.grid
     if grid is not None and not (isinstance(grid, Grid) and grid.ndim == n):
         raise ValueError(f"simulate_output: grid is {arguments.shown(grid)}, wanted a Grid of {n} axes, as x0 has")
     return grid

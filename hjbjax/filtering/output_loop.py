@@ -56,6 +56,15 @@ class Observer(Protocol):
         """The point estimate of x, shape (n,)."""
 
 
+@runtime_checkable
+class GridObserver(Observer, Protocol):
+    """An observer on a grid, whose periodic axes are the periodic states of the loop."""
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes."""
+
+
 @pytree_dataclass()
 class OutputPath:
     """The history of a loop closed through an observer; a batch of paths adds a leading axis to every array.
@@ -92,9 +101,22 @@ class OutputPath:
         return 0 - self.cost
 
     @property
+    def held(self) -> bool:
+        """True: each control is constant through its interval."""
+        return True
+
+    @property
     def status(self) -> PathStatus:
         """The reason for the end of a single path."""
         return PathStatus(int(self.code))
+
+
+@runtime_checkable
+class Judge(Protocol):
+    """A control that examines the paths made with it."""
+
+    def judge(self, path: OutputPath) -> None:
+        """Warn if the result of ``simulate_output`` is not to be trusted."""
 
 
 @pytree_dataclass()

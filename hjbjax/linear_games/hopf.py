@@ -133,6 +133,11 @@ class HopfSolution:
         return self.game.terminal.dim
 
     @property
+    def timed(self) -> bool:
+        """True: the methods take (t, x)."""
+        return True
+
+    @property
     def bound(self) -> str | None:
         """ "lower" or "upper" if the formula is only this bound of V; ``None`` if it is V."""
         return None if self.game.exact else "upper" if self.game.negated else "lower"

@@ -1,7 +1,5 @@
 """Checks of the problem of a network: what is refused, and the rule for the minimum of its Hamiltonian."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from hjbjax.hamiltonian import pointwise
@@ -85,15 +83,3 @@ def known_seed(seed: object, name: str) -> int:
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"{name}: got seed = {seed!r}, wanted an integer ≥ 0")
     return int(seed)
-
-
-def begun_layers(guess: object, inputs: int, layers: Sequence[int], name: str) -> None:
-    """Refuse the weights of a guess that do not fit."""
-    weights = getattr(getattr(guess, "ansatz", None), "weights", None)
-    if weights is None:
-        raise TypeError(f"{name}: got guess = {type(guess).__name__}, wanted a NeuralSolution")
-    found = [np.shape(matrix)[0] for matrix, _ in weights]
-    if found != [inputs, *layers]:
-        raise ValueError(
-            f"{name}: the guess has layers {found[1:]} of {found[0]} inputs,\nwanted {list(layers)} of {inputs}"
-        )

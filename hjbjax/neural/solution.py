@@ -80,6 +80,11 @@ class NeuralSolution:
         """T, in units of time; ``None`` for a stationary value."""
         return self.ansatz.horizon if isinstance(self.ansatz, HorizonAnsatz) else None
 
+    @property
+    def timed(self) -> bool:
+        """True over a horizon, with methods that take (t, x) instead of (x)."""
+        return isinstance(self.ansatz, HorizonAnsatz)
+
     def value_at(self, *where: Numbers | Sequence, extrapolate: bool = False) -> Any:
         """V: ``value_at(x)``, or ``value_at(t, x)`` over a horizon.
 
@@ -139,7 +144,7 @@ class NeuralSolution:
         header = {
             "format": FORMAT, "version": VERSION, "ansatz": type(self.ansatz).__name__, "fields": list(fields),
             "layers": len(self.ansatz.weights), "status": int(self.code), "validation": self.validation or {},
-            "seconds": self.seconds, "quadratic": getattr(self.ansatz, "quadratic", True),
+            "seconds": self.seconds, "quadratic": not isinstance(self.ansatz, RestAnsatz) or self.ansatz.quadratic,
         }  # fmt: skip
         arrays |= {"lo": np.asarray(self.lo, float), "hi": np.asarray(self.hi, float)}
         history = np.zeros(0) if self.history is None else np.asarray(self.history, float)
@@ -195,6 +200,24 @@ class NeuralSolution:
         lines = [f"{self.status}: {self.message}"]
         lines += [f"  {name.replace('_', ' '):<16} {value:.4g}" for name, value in (self.validation or {}).items()]
         return "\n".join([*lines, f"  {'seconds':<16} {self.seconds:.3g}"])
+
+
+def begun_weights(guess: object, inputs: int, layers: Sequence[int], name: str) -> Any:
+    """The weights of a guess.
+
+    Raises:
+      TypeError: it is not a NeuralSolution.
+      ValueError: its layers do not fit.
+    """
+    if not isinstance(guess, NeuralSolution):
+        raise TypeError(f"{name}: got guess = {type(guess).__name__}, wanted a NeuralSolution")
+    weights = guess.ansatz.weights
+    found = [np.shape(matrix)[0] for matrix, _ in weights]
+    if found != [inputs, *layers]:
+        raise ValueError(
+            f"{name}: the guess has layers {found[1:]} of {found[0]} inputs,\nwanted {list(layers)} of {inputs}"
+        )
+    return weights
 
 
 def value_of(solution: NeuralSolution, t: Number, x: State) -> Scalar:

@@ -173,7 +173,9 @@ class Problem:
     ):
         _check_functions(drift, target)
         _check_sets(controls, disturbances)
-        count = 0 if controls is None else getattr(controls, "dim", None)  # unknown for a function of the state
+        count = (
+            None if callable(controls) else 0 if controls is None else controls.dim
+        )  # unknown for a function of the state
         words = labelling.checked(control_names, control_units, inside, count)
         # static: the order of min and max is part of a compiled program
         if isaacs not in ("upper", "lower"):

@@ -295,9 +295,14 @@ def _size(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     return np.max(np.where(np.isfinite(sizes), sizes, 0), axis=0)
 
 
+def is_unbounded(admissible: object) -> bool:
+    """True for a box with infinite bounds."""
+    return isinstance(admissible, Box) and admissible.unbounded
+
+
 def refuse_unbounded(admissible: AdmissibleSet | None, caller: str, why: str) -> None:
     """Refuse a box with infinite bounds in a function that requires bounds, with the reason."""
-    if isinstance(admissible, Box) and admissible.unbounded:
+    if is_unbounded(admissible):
         raise ValueError(
             f"{caller}: got infinite bounds, {admissible}; wanted finite bounds: {why}.\n"
             "Give bounds that are wide enough not to matter"
@@ -378,6 +383,14 @@ def extremes(admissible: AdmissibleSet) -> Array:
         return known(admissible.total) * _lattice(admissible, 1)
     # the 2^m corners of the cube around the ball, because no polytope inside the ball contains it
     return admissible.radius * np.array(list(itertools.product((-1.0, 1.0), repeat=admissible.dim)))
+
+
+def ranges(admissible: AdmissibleSet) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest number of each input, shape (m,); infinite where a box has no bound."""
+    if isinstance(admissible, Box):
+        return np.asarray(admissible.lo, float), np.asarray(admissible.hi, float)
+    corners = np.asarray(extremes(admissible), float)
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def probes(admissible: AdmissibleSet | None, dtype: DType) -> list[list]:

@@ -104,7 +104,7 @@ class SemiLagrangian(Scheme, Paths):
             (problem.running_max is not None, "a running_max: the maximum is evaluated at nodes only"),
             (bool(grid.sides("open")), "open ends, beyond which there is nothing to interpolate"),
             (bool(grid.prescribed()), "prescribed ends, which arcs may cross"),
-            (getattr(problem.controls, "unbounded", False), "infinite bounds: its actions are samples"),
+            (sets.is_unbounded(problem.controls), "infinite bounds: its actions are samples"),
             (bool(grid.sides("constrained")), "constrained ends, which all long arcs near them may cross"),
         ):
             if present:

@@ -8,7 +8,7 @@ every step the parameters are moved to the nearest point within their bounds.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,6 @@ from hjbjax.problem.pytree import INTERRUPT, front_door, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution import files
 from hjbjax.solution.clock import CUT, Clock, noting_interrupts
-from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.host_loop import progress_bar
@@ -30,7 +29,6 @@ EARLY = 1e-3  # fraction of the tolerance at which a run ends before its last st
 PATIENCE = 10  # the least number of steps without improvement after which a fit has converged
 DIFFERENCE = 1e-4  # relative step of the finite difference that checks the gradient
 FAULTY = 0.01  # relative error of a directional derivative above which the gradient is wrong
-FORMAT, VERSION = "hjbjax.Fit", 1
 
 MESSAGES = {
     Status.CONVERGED: "The loss stopped decreasing.",
@@ -42,11 +40,12 @@ MESSAGES = {
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(files.Saved):
     """The result of ``fit``.
 
     Args:
-      parameters: the best parameters, of the structure of the initial ones, in NumPy.
+      parameters: the best parameters, of the structure of the initial ones, in NumPy. After ``Fit.load`` a dictionary
+        from the place of each array, such as "['mass']", to the array, because a file holds no classes.
       loss: the loss at these parameters.
       history: the loss before every step of the best run, shape (k,).
       status: CONVERGED, MAX_STEPS, NONFINITE, INTERRUPTED or TIME_LIMIT.
@@ -55,6 +54,8 @@ class Fit:
         ``None`` if it was not checked.
       seconds: the duration.
     """
+
+    FORMAT = "hjbjax.Fit"
 
     parameters: Any
     loss: float
@@ -69,40 +70,32 @@ class Fit:
         """The outcome and the remedy in one or two sentences."""
         return MESSAGES.get(self.status, self.status.message)
 
-    def save(self, path: Path, *, force: bool = False) -> None:
-        """Write the result to ``path`` atomically; ``Fit.load`` reads it.
-
-        Args:
-          path: the file.
-          force: replace an existing file.
-
-        Raises:
-          FileExistsError: the file exists, without ``force``.
-          FileError: the file cannot be written.
-        """
+    def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         leaves, _ = jax.tree_util.tree_flatten_with_path(self.parameters)
         names = [jax.tree_util.keystr(where) for where, _ in leaves]
         arrays = {f"parameter{i}": np.asarray(leaf, float) for i, (_, leaf) in enumerate(leaves)}
         header = {
-            "format": FORMAT, "version": VERSION, "names": names, "loss": self.loss, "status": int(self.status),
-            "starts": self.starts, "gradient_error": self.gradient_error, "seconds": self.seconds,
+            "names": names, "loss": self.loss, "status": int(self.status), "starts": self.starts,
+            "gradient_error": self.gradient_error, "seconds": self.seconds,
         }  # fmt: skip
-        files.write(path, header, {**arrays, "history": self.history}, force=force)
+        return header, {**arrays, "history": self.history}
+
+    @staticmethod
+    def _plan(header: dict) -> dict[str, files.Expected]:
+        """The arrays of a file."""
+        shapes = tuple((None,) * axes for axes in range(5))
+        each = {f"parameter{i}": files.Expected(shapes, (np.float64,)) for i in range(len(header["names"]))}
+        return {**each, "history": files.Expected(((None,),), (np.float64,), optional=False)}
 
     @classmethod
-    def load(cls, path: Path) -> "Fit":
-        """The result in a file written by ``save``.
-
-        Its parameters are a dictionary from the place of each array, such as "['mass']", to the array, because a file
-        holds no classes.
-
-        Args:
-          path: the file.
-
-        Raises:
-          FileError: the file is missing, damaged or foreign.
-        """
-        return files.read(path, FORMAT, VERSION, _plan, _from_file)
+    def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
+        """The result with the header and the arrays of a file."""
+        found = {name: arrays[f"parameter{i}"] for i, name in enumerate(header["names"])}
+        error = header["gradient_error"]
+        return cls(
+            found, float(header["loss"]), arrays["history"], Status(header["status"]),
+            tuple(map(float, header["starts"])), None if error is None else float(error), float(header["seconds"]),
+        )  # fmt: skip
 
     def __str__(self) -> str:
         lines = [f"{self.status.name}: loss {self.loss:.6g} after {len(self.history)} steps, {self.seconds:.3g} s"]
@@ -348,20 +341,3 @@ def _gradient_error(task: _Task, draw: np.random.Generator) -> float:
             "Kinks, targets between nodes and coarse tolerances of a solve cause this; a smaller tol= may help"
         )
     return error
-
-
-def _plan(header: dict) -> dict[str, files.Expected]:
-    """The arrays of a file."""
-    shapes = tuple((None,) * axes for axes in range(5))
-    each = {f"parameter{i}": files.Expected(shapes, (np.float64,)) for i in range(len(header["names"]))}
-    return {**each, "history": files.Expected(((None,),), (np.float64,), optional=False)}
-
-
-def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> Fit:
-    """The result with the header and the arrays of a file."""
-    found = {name: arrays[f"parameter{i}"] for i, name in enumerate(header["names"])}
-    error = header["gradient_error"]
-    return Fit(
-        found, float(header["loss"]), arrays["history"], Status(header["status"]),
-        tuple(map(float, header["starts"])), None if error is None else float(error), float(header["seconds"]),
-    )  # fmt: skip

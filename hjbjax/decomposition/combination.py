@@ -11,7 +11,7 @@ equal, and both kinds are evaluated.
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -27,16 +27,14 @@ from hjbjax.problem.pytree import is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Numbers
 from hjbjax.solution import archive, files
-from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
-FORMAT, VERSION = "hjbjax.BlockSolution", 1
 Places = tuple[tuple[int, ...], ...]
 
 
 @pytree_dataclass(static=("rule", "bound", "states", "controls", "disturbances", "labels"), host=("problem",))
-class BlockSolution:
+class BlockSolution(files.Saved):
     """The value of a problem that falls apart into blocks; made by ``Decomposition.solve`` and ``march``.
 
     Args:
@@ -49,6 +47,8 @@ class BlockSolution:
       labels: names and units of the controls, the side of the level set, and whether V is a cost or a reward.
       problem: the whole problem; ``None`` on return from ``jit`` or from a file; host data.
     """
+
+    FORMAT = "hjbjax.BlockSolution"
 
     parts: tuple[Solution, ...]
     rule: str
@@ -166,20 +166,7 @@ class BlockSolution:
             discrete=any(part.discrete for part in self.parts),
         )  # fmt: skip
 
-    def save(self, path: Path, *, force: bool = False) -> None:
-        """Write the solutions of all blocks to one file; ``BlockSolution.load`` reads it.
-
-        Args:
-          path: the file.
-          force: replace an existing file.
-
-        Raises:
-          FileExistsError: the file exists, without ``force``.
-          FileError: the file cannot be written.
-          ValueError: the solution is traced.
-        """
-        if is_traced(self):
-            raise ValueError("BlockSolution.save: got a traced solution; save it outside of jit, vmap and grad")
+    def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         headers: list[dict] = []
         arrays: dict[str, np.ndarray] = {}
         for i, part in enumerate(self.parts):
@@ -187,25 +174,31 @@ class BlockSolution:
             headers.append(header)
             arrays |= {f"part{i}.{name}": array for name, array in own.items()}
         names = ("rule", "bound", "states", "controls", "disturbances", "labels")
-        header = {
-            "format": FORMAT,
-            "version": VERSION,
-            "parts": headers,
-            **{name: getattr(self, name) for name in names},
+        return {"parts": headers, **{name: getattr(self, name) for name in names}}, arrays
+
+    @staticmethod
+    def _plan(header: dict) -> dict[str, files.Expected]:
+        """The arrays of a file: those of every block."""
+        return {
+            f"part{i}.{name}": expected
+            for i, own in enumerate(header["parts"])
+            for name, expected in archive.plan(own).items()
         }
-        files.write(path, header, arrays, force=force)
 
     @classmethod
-    def load(cls, path: Path) -> "BlockSolution":
-        """The solution in a file written by ``save``, without its problem.
-
-        Args:
-          path: the file.
-
-        Raises:
-          FileError: the file is missing, damaged or foreign.
-        """
-        return files.read(path, FORMAT, VERSION, _plan, _from_file)
+    def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
+        """The solution with a header and arrays of a file."""
+        parts = []
+        for i, own in enumerate(header["parts"]):
+            mine = {name.partition(".")[2]: array for name, array in arrays.items() if name.startswith(f"part{i}.")}
+            parts.append(Solution(**archive.fields(own, mine)))
+        states, controls, disturbances = (
+            tuple(tuple(map(int, each)) for each in header[name]) for name in ("states", "controls", "disturbances")
+        )
+        return cls(
+            tuple(parts), header["rule"], header["bound"], states, controls, disturbances,
+            labelling.of_file(header["labels"]),
+        )  # fmt: skip
 
     def _count(self, places: Places) -> int:
         """The number of states, controls or disturbances of the whole problem."""
@@ -306,27 +299,3 @@ def _placed(entries: Sequence[Any], places: Sequence[tuple[int, ...]], count: in
             entry = xp.asarray(values)[..., k]
             columns[place] = entry if mine is None else xp.where(mine, entry, columns[place])
     return xp.stack(columns, axis=-1) if columns else xp.zeros((*shape, 0))
-
-
-def _plan(header: dict) -> dict[str, files.Expected]:
-    """The arrays of a file: those of every block."""
-    return {
-        f"part{i}.{name}": expected
-        for i, own in enumerate(header["parts"])
-        for name, expected in archive.plan(own).items()
-    }
-
-
-def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> BlockSolution:
-    """The solution with a header and arrays of a file."""
-    parts = []
-    for i, own in enumerate(header["parts"]):
-        mine = {name.partition(".")[2]: array for name, array in arrays.items() if name.startswith(f"part{i}.")}
-        parts.append(Solution(**archive.fields(own, mine)))
-    states, controls, disturbances = (
-        tuple(tuple(map(int, each)) for each in header[name]) for name in ("states", "controls", "disturbances")
-    )
-    return BlockSolution(
-        tuple(parts), header["rule"], header["bound"], states, controls, disturbances,
-        labelling.of_file(header["labels"]),
-    )  # fmt: skip

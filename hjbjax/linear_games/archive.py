@@ -9,7 +9,6 @@ from hjbjax.linear_games.linear_dynamics import LinearGame
 from hjbjax.problem.sets import Ball, Box, Finite, Simplex
 from hjbjax.solution.files import Expected, FileError
 
-FORMAT, VERSION = "hjbjax.HopfSolution", 1
 MATRICES = ("drift", "constant", "own", "other")
 SETS = ("own_set", "other_set", "effective")
 SHAPES = (*(((None,) * axes) for axes in range(3)),)

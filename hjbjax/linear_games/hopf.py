@@ -13,7 +13,7 @@ The formula is due to E. Hopf, Generalized solutions of nonlinear equations of f
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,6 @@ from hjbjax.problem.pytree import cast, front_door, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, Numbers
 from hjbjax.solution import files
-from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 
@@ -101,7 +100,7 @@ def hopf(
 
 
 @pytree_dataclass(static=("intervals", "tol", "labels"), host=("problem",))
-class HopfSolution:
+class HopfSolution(files.Saved):
     """The value of a linear game with a convex terminal cost, evaluated state by state; made by ``hopf``.
 
     All times are between 0 and the horizon. Results are float64 NumPy for numbers; under ``jit``, ``vmap`` and ``grad``
@@ -117,6 +116,8 @@ class HopfSolution:
       labels: names and units of the controls.
       problem: the problem; ``None`` on return from ``jit``; host data.
     """
+
+    FORMAT = "hjbjax.HopfSolution"
 
     game: LinearGame
     horizon: Any
@@ -229,40 +230,6 @@ class HopfSolution:
             problem=self.problem, message="The generalised Hopf formula at the nodes.", stats={"method": repr(self)},
         )  # fmt: skip
 
-    def save(self, path: Path, *, force: bool = False) -> None:
-        """Write matrices, sets and the terminal cost to ``path`` atomically; ``HopfSolution.load`` reads them.
-
-        Args:
-          path: the file.
-          force: replace an existing file.
-
-        Raises:
-          FileExistsError: the file exists, without ``force``.
-          FileError: the file cannot be written.
-          ValueError: the solution is traced, or its terminal cost was made by ``hjb.convex.smooth``.
-        """
-        if is_traced(self):
-            raise ValueError("HopfSolution.save: got a traced solution; save it outside of jit, vmap and grad")
-        header, arrays = archive.contents(self.game)
-        header |= {
-            "format": archive.FORMAT, "version": archive.VERSION, "horizon": float(self.horizon),
-            "intervals": self.intervals, "tol": self.tol, "labels": self.labels,
-            "players": [self.controls is not None, self.disturbances is not None],
-        }  # fmt: skip
-        files.write(path, header, arrays, force=force)
-
-    @classmethod
-    def load(cls, path: Path) -> "HopfSolution":
-        """The solution in a file written by ``save``, without its problem.
-
-        Args:
-          path: the file.
-
-        Raises:
-          FileError: the file is missing, damaged or foreign.
-        """
-        return files.read(path, archive.FORMAT, archive.VERSION, archive.plan, _from_file)
-
     def _evaluate(self, name: str, t: Numbers, x: Numbers | Sequence) -> Any:
         """The part of the answers with this name for states (..., n) at times (...)."""
         return _evaluate_traced(self, name, t, x) if is_traced(self, t, x) else self._everything(name, t, x)[name]
@@ -292,21 +259,33 @@ class HopfSolution:
             )
         return {part: each.reshape((*shape, *each.shape[1:])) for part, each in found.items()}
 
+    def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        header, arrays = archive.contents(self.game)
+        header |= {
+            "horizon": float(self.horizon), "intervals": self.intervals, "tol": self.tol, "labels": self.labels,
+            "players": [self.controls is not None, self.disturbances is not None],
+        }  # fmt: skip
+        return header, arrays
+
+    @staticmethod
+    def _plan(header: dict) -> dict[str, files.Expected]:
+        return archive.plan(header)
+
+    @classmethod
+    def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
+        """The solution with a header and arrays of a file."""
+        game = archive.rebuild(header, arrays)
+        sets = (game.other_set, game.own_set) if game.negated else (game.own_set, game.other_set)
+        controls, disturbances = (each if there else None for each, there in zip(sets, header["players"], strict=True))
+        labels = labelling.of_file(header["labels"])
+        return cls(
+            game, header["horizon"], controls, disturbances, int(header["intervals"]), float(header["tol"]), labels
+        )
+
     def __repr__(self) -> str:
         what = "V" if self.bound is None else f"{self.bound} bound of V"
         horizon = "traced" if is_traced(self.horizon) else f"{float(self.horizon):g}"
         return f"HopfSolution({what} in {self.game.terminal.dim} states, horizon {horizon})"
-
-
-def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> HopfSolution:
-    """The solution with a header and arrays of a file."""
-    game = archive.rebuild(header, arrays)
-    sets = (game.other_set, game.own_set) if game.negated else (game.own_set, game.other_set)
-    controls, disturbances = (each if there else None for each, there in zip(sets, header["players"], strict=True))
-    labels = labelling.of_file(header["labels"])
-    return HopfSolution(
-        game, header["horizon"], controls, disturbances, int(header["intervals"]), float(header["tol"]), labels
-    )
 
 
 def _check_states(name: str, n: int, shape: tuple[int, ...]) -> None:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,6 @@ from hjbjax.solution.placement import FileError, Path
 from hjbjax.solution.status import Status
 from hjbjax.tracing import checks, closures
 
-FORMAT, VERSION = "hjbjax.NeuralSolution", 1
 BLOCKS = (1, 32, 1024)  # the numbers of states of one compiled program
 MESSAGES = {
     Status.CONVERGED: "The error on held-out data is below tol.",
@@ -32,7 +31,7 @@ MESSAGES = {
 
 
 @pytree_dataclass(static=("rule",), host=("code", "validation", "history", "seconds"))
-class NeuralSolution:
+class NeuralSolution(files.Saved):
     """A value given by a network, made by ``neural.solve`` and ``neural.deep_bsde``.
 
     It can be called like a feedback and passed to ``simulate`` and ``greedy_feedback``. Results are float64 NumPy for
@@ -49,6 +48,8 @@ class NeuralSolution:
       history: the held-out error before training and after every 25 steps, shape (k,).
       seconds: the duration.
     """
+
+    FORMAT = "hjbjax.NeuralSolution"
 
     ansatz: Any
     lo: Any
@@ -123,48 +124,6 @@ class NeuralSolution:
         """The control, as ``control_at``."""
         return self.control_at(*where)
 
-    def save(self, path: Path, *, force: bool = False) -> None:
-        """Write the weights and the errors to ``path`` atomically; ``NeuralSolution.load`` reads them.
-
-        Args:
-          path: the file.
-          force: replace an existing file.
-
-        Raises:
-          FileExistsError: the file exists, without ``force``.
-          FileError: the file cannot be written.
-          ValueError: the solution is traced.
-        """
-        if is_traced(self):
-            raise ValueError("NeuralSolution.save: got a traced solution; save it outside of jit, vmap and grad")
-        fields = {name: each for name, each in vars(self.ansatz).items() if name not in ("weights", "quadratic")}
-        arrays = {name: np.asarray(each, float) for name, each in fields.items()}
-        for i, (matrix, bias) in enumerate(self.ansatz.weights):
-            arrays |= {f"matrix{i}": np.asarray(matrix, float), f"bias{i}": np.asarray(bias, float)}
-        header = {
-            "format": FORMAT, "version": VERSION, "ansatz": type(self.ansatz).__name__, "fields": list(fields),
-            "layers": len(self.ansatz.weights), "status": int(self.code), "validation": self.validation or {},
-            "seconds": self.seconds, "quadratic": not isinstance(self.ansatz, RestAnsatz) or self.ansatz.quadratic,
-        }  # fmt: skip
-        arrays |= {"lo": np.asarray(self.lo, float), "hi": np.asarray(self.hi, float)}
-        history = np.zeros(0) if self.history is None else np.asarray(self.history, float)
-        files.write(path, header, {**arrays, "history": history}, force=force)
-
-    @classmethod
-    def load(cls, path: Path, problem: Problem | None = None) -> "NeuralSolution":
-        """The solution in a file written by ``save``.
-
-        Args:
-          path: the file.
-          problem: the problem, which a file cannot hold. Needed for controls, and for values over a horizon, which
-            contain the terminal cost.
-
-        Raises:
-          FileError: the file is missing, damaged or foreign.
-        """
-        found = files.read(path, FORMAT, VERSION, _plan, _from_file)
-        return found if problem is None else with_problem(found, problem)
-
     def _evaluate(self, name: str, where: tuple, extrapolate: bool) -> Any:
         """One of the lookups at states (..., n)."""
         timed, n = self.horizon is not None, self.ndim
@@ -191,6 +150,59 @@ class NeuralSolution:
             with own_settings(x64=True):
                 found = _in_blocks(cast(self, np.float64), name, extrapolate, t, x)
         return found.reshape((*shape, *found.shape[1:]))
+
+    @classmethod
+    def load(cls, path: Path, problem: Problem | None = None) -> "NeuralSolution":
+        """The solution in a file written by ``save``.
+
+        Args:
+          path: the file.
+          problem: the problem, which a file cannot hold. Needed for controls, and for values over a horizon, which
+            contain the terminal cost.
+
+        Raises:
+          FileError: the file is missing, damaged or foreign.
+        """
+        found = super().load(path)
+        return found if problem is None else with_problem(found, problem)
+
+    def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        fields = {name: each for name, each in vars(self.ansatz).items() if name not in ("weights", "quadratic")}
+        arrays = {name: np.asarray(each, float) for name, each in fields.items()}
+        for i, (matrix, bias) in enumerate(self.ansatz.weights):
+            arrays |= {f"matrix{i}": np.asarray(matrix, float), f"bias{i}": np.asarray(bias, float)}
+        header = {
+            "ansatz": type(self.ansatz).__name__, "fields": list(fields), "layers": len(self.ansatz.weights),
+            "status": int(self.code), "validation": self.validation or {}, "seconds": self.seconds,
+            "quadratic": not isinstance(self.ansatz, RestAnsatz) or self.ansatz.quadratic,
+        }  # fmt: skip
+        arrays |= {"lo": np.asarray(self.lo, float), "hi": np.asarray(self.hi, float)}
+        history = np.zeros(0) if self.history is None else np.asarray(self.history, float)
+        return header, {**arrays, "history": history}
+
+    @staticmethod
+    def _plan(header: dict) -> dict[str, files.Expected]:
+        """The arrays of a file."""
+        shapes = tuple((None,) * axes for axes in range(3))
+        names = [*header["fields"], "lo", "hi", "history"]
+        for i in range(header["layers"]):
+            names += [f"matrix{i}", f"bias{i}"]
+        return {name: files.Expected(shapes, (np.float64,), optional=False) for name in names}
+
+    @classmethod
+    def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
+        """The solution with the header and the arrays of a file."""
+        kinds: dict[str, Any] = {kind.__name__: kind for kind in (RestAnsatz, HorizonAnsatz)}
+        if header["ansatz"] not in kinds:
+            raise FileError(f"its ansatz {header['ansatz']!r} is not known here: update hjbjax")
+        weights = tuple((arrays[f"matrix{i}"], arrays[f"bias{i}"]) for i in range(header["layers"]))
+        options: dict[str, Any] = {} if header["quadratic"] else {"quadratic": False}
+        ansatz = kinds[header["ansatz"]](weights, **{name: arrays[name] for name in header["fields"]}, **options)
+        validation = {name: float(value) for name, value in header["validation"].items()}
+        return cls(
+            ansatz, arrays["lo"], arrays["hi"], None, None, int(Status(header["status"])), validation,
+            arrays["history"], float(header["seconds"]),
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         over = "" if self.horizon is None or is_traced(self.horizon) else f" over {float(self.horizon):g}"
@@ -269,28 +281,4 @@ def with_problem(solution: NeuralSolution, problem: Problem) -> NeuralSolution:
     return NeuralSolution(
         solution.ansatz, solution.lo, solution.hi, problem, rule, solution.code, solution.validation, solution.history,
         solution.seconds,
-    )  # fmt: skip
-
-
-def _plan(header: dict) -> dict[str, files.Expected]:
-    """The arrays of a file."""
-    shapes = tuple((None,) * axes for axes in range(3))
-    names = [*header["fields"], "lo", "hi", "history"]
-    for i in range(header["layers"]):
-        names += [f"matrix{i}", f"bias{i}"]
-    return {name: files.Expected(shapes, (np.float64,), optional=False) for name in names}
-
-
-def _from_file(header: dict, arrays: dict[str, np.ndarray]) -> NeuralSolution:
-    """The solution with the header and the arrays of a file."""
-    kinds: dict[str, Any] = {kind.__name__: kind for kind in (RestAnsatz, HorizonAnsatz)}
-    if header["ansatz"] not in kinds:
-        raise FileError(f"its ansatz {header['ansatz']!r} is not known here: update hjbjax")
-    weights = tuple((arrays[f"matrix{i}"], arrays[f"bias{i}"]) for i in range(header["layers"]))
-    options: dict[str, Any] = {} if header["quadratic"] else {"quadratic": False}
-    ansatz = kinds[header["ansatz"]](weights, **{name: arrays[name] for name in header["fields"]}, **options)
-    validation = {name: float(value) for name, value in header["validation"].items()}
-    return NeuralSolution(
-        ansatz, arrays["lo"], arrays["hi"], None, None, int(Status(header["status"])), validation, arrays["history"],
-        float(header["seconds"]),
     )  # fmt: skip

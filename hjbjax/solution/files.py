@@ -7,6 +7,7 @@ and rejects declared sizes that exceed the file's own size, so a false claim of 
 raises ``FileError``.
 """
 
+import abc
 import errno
 import json
 import math
@@ -16,10 +17,11 @@ import stat
 import struct
 import zipfile
 from collections.abc import Callable, Mapping
-from typing import IO, Any, NamedTuple, TypeVar
+from typing import IO, Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 
+from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.types import DType
 from hjbjax.solution import screen
 from hjbjax.solution.placement import (
@@ -299,3 +301,58 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
         array = np.lib.format.read_array(member, allow_pickle=False)
         member.read()  # to the end, where the checksum is compared
     return array
+
+
+class Saved(abc.ABC):
+    """The methods ``save`` and ``load`` of a result that one file holds.
+
+    A subclass has the class variables FORMAT, the name of the format, and VERSION, which is incremented when an older
+    hjbjax would misread a file.
+    """
+
+    FORMAT: ClassVar[str]
+    VERSION: ClassVar[int] = 1
+
+    def save(self, path: Path, *, force: bool = False) -> None:
+        """Write the result to ``path`` atomically; ``load`` of the same class reads it.
+
+        Args:
+          path: the file.
+          force: replace an existing file.
+
+        Raises:
+          FileExistsError: the file exists, without ``force``.
+          FileError: the file cannot be written.
+          ValueError: the result is traced, or contains a function that a file cannot hold.
+        """
+        if is_traced(self):
+            name = type(self).__name__
+            raise ValueError(f"{name}.save: got a traced solution; save it outside of jit, vmap and grad")
+        header, arrays = self._contents()
+        write(path, {"format": self.FORMAT, "version": self.VERSION, **header}, arrays, force=force)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """The result in a file written by ``save``, without its problem.
+
+        Args:
+          path: the file.
+
+        Raises:
+          FileError: the file is missing, damaged or foreign.
+        """
+        return read(path, cls.FORMAT, cls.VERSION, cls._plan, cls._from_file)
+
+    @abc.abstractmethod
+    def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Header and arrays of a file."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def _plan(header: dict) -> Mapping[str, Expected]:
+        """The arrays of a file with this header."""
+
+    @classmethod
+    @abc.abstractmethod
+    def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
+        """The result with the header and the arrays of a file."""

@@ -19,6 +19,7 @@ Source: H. J. Kushner and P. Dupuis, Numerical Methods for Stochastic Control Pr
 import dataclasses
 import functools
 import itertools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -60,13 +61,39 @@ class Rates:
         first, *others = (*self.values, *(landing.rate for landing in self.landings), *ending)
         return sum(others, start=first)  # start=0 would cost one more array
 
+    def jumps(self, grid: Grid, *, continued: bool = False) -> Iterator[tuple[Any, Callable[[Any], Any]]]:
+        """For every jump its rate, and the function that reads node values at its end.
+
+        Args:
+          grid: the grid.
+          continued: beyond the ends of the box read V as it continues there; otherwise the value of the last node.
+        """
+        move = stencil.continued if continued else stencil.neighbour
+        for offset, c in zip(self.offsets, self.values, strict=True):
+            yield c, functools.partial(move, grid=grid, offset=offset)
+        for landing in self.landings:
+            yield landing.rate, landing.ahead
+
     def apply(self, grid: Grid, values: jax.Array) -> jax.Array:
         """𝓛V for node values V, shape (*grid); cost per unit time."""
-        jumps = zip(self.offsets, self.values, strict=True)
         # differences first: c V(x + o) and c V(x) are both large for small h, while their difference is not
-        terms = [c * (stencil.continued(values, grid, offset) - values) for offset, c in jumps]
-        terms += [landing.rate * (landing.ahead(values) - values) for landing in self.landings]
+        terms = [c * (ahead(values) - values) for c, ahead in self.jumps(grid, continued=True)]
         return sum(terms[1:], start=terms[0])
+
+    def products(self, grid: Grid, values: jax.Array, *, change: bool = False) -> list[jax.Array]:
+        """The terms c V(y), one per jump, (*grid); zero beyond the ends of the box, unless V continues there.
+
+        Args:
+          grid: the grid.
+          values: V, or a change of V.
+          change: ``values`` are a change of V, which is continued beyond open ends.
+        """
+        pairs = zip(self.offsets, self.values, strict=True)
+        if change and grid.sides("open"):
+            terms = [c * stencil.continued(values, grid, offset, change=True) for offset, c in pairs]
+        else:
+            terms = [c * stencil.neighbour(values, grid, offset, ghost=False) for offset, c in pairs]
+        return terms + [landing.product(values) for landing in self.landings]
 
     def scaled(self, factor: Any) -> "Rates":
         """Every rate times ``factor``, shape (*grid) or a number."""

@@ -231,13 +231,7 @@ def _with_exact_interventions(equation: PolicyEquation, delta: Field) -> Field:
 
 def left_over(equation: PolicyEquation, grid: Grid, delta: Field) -> Field:
     """s + Σ_o w_o δ(x + o) − δ, the residual of a correction."""
-    jumps = zip(equation.weights.offsets, equation.weights.values, strict=True)
-    if grid.sides("open"):
-        terms = [w * stencil.continued(delta, grid, offset, change=True) for offset, w in jumps]
-    else:  # no weight leads out
-        terms = [w * stencil.neighbour(delta, grid, offset, ghost=False) for offset, w in jumps]
-    terms += [landing.product(delta) for landing in equation.weights.landings]
-    return sum(terms, start=equation.source - delta)
+    return sum(equation.weights.products(grid, delta, change=True), start=equation.source - delta)
 
 
 def _to_neighbours(equation: PolicyEquation) -> PolicyEquation:

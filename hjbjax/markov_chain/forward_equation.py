@@ -106,10 +106,7 @@ def advanced(
 
 def _moved(on: Discretisation, stays: Field, moves: Rates, p: Field) -> Field:
     """The probabilities after at most one jump of the chain."""
-    found = stays * p
-    for offset, share in zip(moves.offsets, moves.values, strict=True):
-        found = found + share * stencil.neighbour(p, on.grid, offset, ghost=False)
-    return found
+    return sum(moves.products(on.grid, p), start=stays * p)
 
 
 def cells(on: Discretisation) -> Array:

@@ -144,10 +144,7 @@ def after_duration(jumps: Rates, grid: Grid, law: Field, duration: Number) -> Fi
     stays, moves = 1 - leaving / fastest, jumps.inflow(grid).scaled(1 / fastest)
 
     def moved(p: Field) -> Field:
-        found = stays * p
-        for offset, share in zip(moves.offsets, moves.values, strict=True):
-            found = found + share * stencil.neighbour(p, grid, offset, ghost=False)
-        return sum((landing.product(p) for landing in moves.landings), start=found)
+        return sum(moves.products(grid, p), start=stays * p)
 
     def term(k: Any, carry: tuple) -> tuple:
         p, weight, total, weights = carry

@@ -120,10 +120,8 @@ def _gaining(task: Task, state: State, stopping: jax.Array) -> jax.Array:
     indifferent = stopping & free & (policy.defect <= jnp.maximum(rounding, on.decay * task.tol))
 
     def spread(continuing: jax.Array) -> jax.Array:
-        for offset, rate in zip(rates.offsets, rates.values, strict=True):
-            continuing |= indifferent & (rate > 0) & stencil.neighbour(continuing, grid, offset)
-        for landing in rates.landings:
-            continuing |= indifferent & (landing.rate > 0) & landing.ahead(continuing)
+        for rate, ahead in rates.jumps(grid):
+            continuing |= indifferent & (rate > 0) & ahead(continuing)
         return continuing
 
     def grows(both: tuple[jax.Array, jax.Array]) -> jax.Array:

@@ -115,11 +115,9 @@ def _all_rates(rates: Rates) -> list[jax.Array]:
 def _stays(rates: Rates, grid: Grid, inside: jax.Array, least: Number) -> jax.Array:
     """The nodes from which all jumps at rates above ``least`` lead ``inside``, bool (*grid)."""
     stays = jnp.ones(grid.shape, bool)
-    for offset, c in zip(rates.offsets, rates.values, strict=True):
+    for c, ahead in rates.jumps(grid):
         # no jump leaves the box: rates that lead out are zero
-        stays &= (c <= least) | stencil.neighbour(inside, grid, offset)
-    for landing in rates.landings:
-        stays &= (landing.rate <= least) | landing.ahead(inside)
+        stays &= (c <= least) | ahead(inside)
     return stays
 
 
@@ -246,10 +244,7 @@ def _controllable_predecessors(
         def also(ok: jax.Array, second: jax.Array) -> tuple[jax.Array, None]:
             u, d = (first, second) if upper else (second, first)
             rates = jump_rates(on, list(u), list(d))
-            jumps = zip(rates.offsets, rates.values, strict=True)
-            leading = [(c > least) & stencil.neighbour(found, grid, offset) for offset, c in jumps]
-            leading += [(landing.rate > least) & landing.ahead(found) for landing in rates.landings]
-            leads = functools.reduce(jnp.logical_or, leading)
+            leads = functools.reduce(jnp.logical_or, [(c > least) & ahead(found) for c, ahead in rates.jumps(grid)])
             allowed = ~edges.inadmissible(on, list(u), list(d))
             # for every disturbance one jump must lead on, and none may leave
             good = leads & allowed & _stays(rates, grid, inside, least)

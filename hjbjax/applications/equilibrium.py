@@ -293,7 +293,7 @@ def _in_program(economy: _Economy, ends: Any, tol: Number) -> Equilibrium:
     root, value, found = _search(functools.partial(evaluated, still), ends, tol, nothing)
     slope = jax.jvp(lambda price: evaluated(still, price, value)[0], (root,), (jnp.ones_like(root),))[1]
     excess = evaluated(numbers, root, value)[0]
-    # the number of ``root`` with the derivative −dE/(∂E/∂r)
+    # equal to ``root``, with the derivative −dE/(∂E/∂r) of the implicit function
     price = root - (excess - jax.lax.stop_gradient(excess)) / jax.lax.stop_gradient(slope)
     result, known = economy.at(price, value), jnp.where(found, 1.0, jnp.nan)
     solution = altered(result.solution, value=result.solution.value * known, policy=result.solution.policy * known)

@@ -183,7 +183,7 @@ def fit(
                 "is NaN here:\ncall the loss outside of fit to see the reason"
             )
         found = jax.tree.map(np.asarray, task.parameters(best.z))
-        # a run that was cut short leaves a better earlier run as it is, but the fit is not complete
+        # the best run may be an earlier one; the fit is still incomplete if any run was cut short
         status = next((run.status for run in runs if run.status in CUT), best.status)
     return Fit(
         found, best.loss, np.array(best.history), status, tuple(run.loss for run in runs), error, clock.elapsed()

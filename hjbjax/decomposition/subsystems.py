@@ -121,7 +121,7 @@ def find_blocks(problem: Problem, n: int, *, bound: bool) -> Blocks:
 
 
 def _check_ingredients(problem: Problem) -> None:
-    """Refuse what has no decomposition, with the reason."""
+    """Refuse a problem that has no decomposition, with the reason."""
     for name, why in REFUSED.items():
         if getattr(problem, name) is not None:
             raise ValueError(f"decompose: got a problem with {name}, which couples the blocks: {why}")

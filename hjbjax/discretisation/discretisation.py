@@ -249,7 +249,7 @@ class Discretisation:
             return [self.drift(u, d, x)]
         found = dependence.influence(self.problem, self.grid.ndim, self.dtype)
         driven, zero = found.drift.driven_by(found.disturbance), jnp.zeros((), self.dtype)
-        # at zero, admissible or not, because any point splits a sum of two functions
+        # any input splits a sum of two functions, so zero need not be admissible
         no_u, no_d = ([zero] * len(inputs) for inputs in (found.control, found.disturbance))
         still, pushed = self.drift(no_u, no_d, x), self.drift(no_u, d, x)
         # exactly zero where the disturbance does not act: the sign of a rounding error, pushed − still = 1e-17, would
@@ -344,9 +344,9 @@ class Discretisation:
     def noisy_walls(self, x: list) -> list[dict[int, jax.Array]]:
         """The nodes where noise reflects, for every axis and the steps −1 and 1 across its walls: bool, one slice each.
 
-        There ∂V/∂n = 0, and slopes must use the mirror image. With the parabola through the last three nodes, the node
-        next to a wall would take its slope, unlimited, from the node behind it, while noise ties the value on the wall
-        to that node. Under drift towards the wall with a < h f both would grow like e^{0.15 f t/h}.
+        There ∂V/∂n = 0, and slopes must use the mirror image. A parabola through the last three nodes would be unstable
+        next to such a wall: the slope at the last inner node would not be limited, and noise couples this node to the
+        value on the wall. Under drift towards the wall with a < h f both values would grow like e^{0.15 f t/h}.
         """
         found: list[dict[int, jax.Array]] = [{} for _ in range(self.grid.ndim)]
         if self.problem.noise is None:

@@ -463,7 +463,7 @@ def _size(error: jax.Array) -> jax.Array:
 
 @functools.cache
 def _bisection() -> type:
-    """The class of optimistix's bisection that stops only by the width of its bracket.
+    """A subclass of optimistix's bisection that stops when its bracket is narrow, whatever the value of the function.
 
     A target function may be steep or jump, so a test of its value would fail or succeed too early. The answer is the
     late end of the bracket, where the function is zero or below.

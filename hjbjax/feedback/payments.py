@@ -37,7 +37,8 @@ MANY = 10  # a path whose cost misses V by more than this number of estimated er
 LEAST = 0.02  # of the range of V: the extra cost allowed for interpolating a feedback between the nodes
 UNKNOWN = 0.02  # of the range of V: the assumed error of a value without an estimate
 STILL = 1e-6  # of the box: the motion, in its second half, of a path that is at rest
-RESTS, SLOWS = 1e-3, 1e-2  # of the box, and of the motion in the first half, for a path that comes to rest
+# a path comes to rest if its second half moves less than these shares of the box and of the motion in the first half
+RESTS, SLOWS = 1e-3, 1e-2
 AWAY, BACK = 0.5, 0.1  # of the extent of its second half, for a path that circles inside a cell
 SAME = 1e-5  # two problems count as the same if their numbers at a state differ by no more than this
 FAR = 1.5  # cells: a circling path moves away from a state by more than this, and returns within one

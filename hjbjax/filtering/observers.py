@@ -138,7 +138,7 @@ class ExtendedKalman:
         n, dtype = mean.shape[0], mean.dtype
         u, dt = jnp.asarray(u, dtype), jnp.asarray(dt, dtype)
 
-        def rates(x: State) -> jax.Array:  # of the state, and of y in units of its noise
+        def rates(x: State) -> jax.Array:  # dx/dt, then dy/dt in units of the noise of y
             drift = jnp.asarray(self.plant.drift(x, u), dtype)
             return jnp.concatenate([drift, self.measurement.whitened(self.measurement.at(x))])
 

@@ -171,7 +171,7 @@ def _rows(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], bends: 
             row[len(inputs) + list(rims).index(each.mine)] = jnp.where(rim.on, entry, 0)
         columns.append(row)
         ends.append(_end(each, entry))
-        kinked.append(~ends[a][0] & ~(jnp.abs(slope) < each.close() * jnp.abs(row[a])))  # also where H is flat
+        kinked.append(~ends[a][0] & ~(jnp.abs(slope) < each.close() * jnp.abs(row[a])))  # also True where H is flat
     kinks = _kinks(at, inputs, kinked)
     held = [ended | unsettled for (ended, _), unsettled in zip(ends, kinked, strict=True)]
     for rim in rims.values():  # if a kink holds an input, the rim determines the others

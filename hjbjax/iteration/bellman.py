@@ -164,7 +164,7 @@ def relaxation(on: Discretisation, value: Field, outflow: Field | None = None) -
     else:
         best, u, d = optimum.optimise(hamiltonian)
         outflow = jnp.maximum(outflow, jump_rates(on, u, d).total() + discount)  # a fast action between the samples
-    # it is a divisor, also where nothing moves
+    # the outflow is 1 where nothing moves, because the sweeps divide by it
     return best - discount * value, jnp.where(outflow > 0, outflow, 1)
 
 

@@ -400,7 +400,7 @@ def _entries(shape: tuple[int, ...], flips: list[jax.Array]) -> tuple[jax.Array,
 
 
 def _folded(place: jax.Array, shape: tuple[int, ...], arrays: Arrays, *, back: bool) -> jax.Array:
-    """An index along the first axis modulo n₀: from below if columns were subtracted, with ``back`` from above."""
+    """An index along the first axis modulo n₀: a negative index, or with ``back`` an index of at least n₀, is moved."""
     count, folds = shape[0], _folds((shape[0], *(shape[axis] for axis in arrays.skewed)))
     if folds > FOLDS:
         return place % count

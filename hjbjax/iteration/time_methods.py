@@ -62,7 +62,7 @@ def stretched(dt: Number, problem: Problem, dtype: DType) -> Scalar:
 
 
 def longest_step(rate: Scalar, problem: Problem, share: Numbers, tableau: "Tableau") -> jax.Array:
-    """The longest step whose Euler steps are monotone if ``share`` is 1/c; inf if nothing moves.
+    """The longest time step; inf if nothing moves. Its Euler stages are monotone if ``share`` is 1/c.
 
     Args:
       rate: the largest Q + β, per unit time.
@@ -76,7 +76,7 @@ def longest_step(rate: Scalar, problem: Problem, share: Numbers, tableau: "Table
     if problem.discounted is False or len(tableau.means) == 1:
         return step
     scaled = jnp.where(moves, jnp.asarray(problem.discount, step.dtype) * jnp.where(moves, step, 1), 0)
-    some = scaled > 0  # S e^{βΔt} (Q + β) is the share at βΔt = log(1 + β share/(Q + β))
+    some = scaled > 0  # S e^{βΔt} (Q + β) equals the share if βΔt = log(1 + β share/(Q + β))
     return step * jnp.where(some, jnp.log1p(scaled) / jnp.where(some, scaled, 1), 1)
 
 

@@ -133,8 +133,8 @@ class Front:
     Args:
       value: V at the time t.
       t: the time, for functions of it; rounded, so steps are not computed from it.
-      left: the time from t back to the end of the interval as two numbers, the second of which is the rounding error of
-        the first: with a single float32 clock at t = 1e5, 223 steps became 896,657.
+      left: the time from t back to the end of the interval, as a number and its rounding error. With a single float32
+        number at t = 1e5 a march took 896,657 steps instead of 223.
       steps: the number of steps taken.
       code: a Status number.
       seen: the rates and the noise of the last step.

@@ -168,7 +168,9 @@ def generator(jumps: Rates, grid: Grid) -> "csr_array":
 
 
 def implicit_step(jumps: Rates, grid: Grid, duration: float) -> "SuperLU":
-    """The factors of 1 − t𝓛* on the host, whose ``solve`` keeps a law non-negative and its sum; one step of Euler.
+    """The factors of 1 − t𝓛* on the host: ``solve`` makes one implicit Euler step of a law.
+
+    The step keeps the law non-negative and preserves its sum.
 
     The matrix is an M-matrix that is diagonally dominant by columns, so it is factored without pivoting.
     """

@@ -422,7 +422,7 @@ def _in_all_processes(path: str) -> Iterator[None]:
 
 
 def describe_question(problems: Sequence[Problem], grid: Grid, **others: Any) -> dict[str, str]:
-    """The problem in digests and words: problems with settled functions, the grid, and other arguments."""
+    """The question of a run by parts, as text: digests of its problems, its grid, and its other arguments."""
     about = (
         grid.shape,
         grid.periodic,

@@ -239,7 +239,7 @@ def _cores() -> int:
 def _solve_side_by_side(
     lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, kept: File | None, choices: Choices
 ) -> list[Solution]:
-    """Solve problems that share a program in parallel, one thread per core, by the numbers of their lanes."""
+    """Solve problems that share a program in parallel, one thread per core; the solutions in the order of ``lanes``."""
     settings, names = host_loop.settings(), list(lanes)
 
     def one(name: int) -> tuple[Solution, list[str]]:
@@ -285,7 +285,7 @@ def _told(name: int, solution: Solution, said: Sequence[str]) -> Solution:
 def _solve_together(
     lanes: dict[int, Discretisation], method: Method, tol: float, clock: Clock, over: Lanes, choices: Choices
 ) -> list[Solution]:
-    """Solve problems as one loop, by the numbers of their lanes; ``choices`` as in ``solve``."""
+    """Solve problems in one loop; the solutions in the order of ``lanes``, with ``choices`` as in ``solve``."""
     asked, found = dict(lanes), dict[int, Solution]()
     prepared: dict[int, tuple[Task, Assumptions, Reach | None]] = {}
     for name, on in lanes.items():

@@ -56,7 +56,7 @@ class Settled(NamedTuple):
         return dataclasses.replace(at_order(self.origin.task, first=False), weights=self.task.weights)
 
     def of_chain(self) -> "Settled":
-        """The end of a monotone iteration without traces of the scheme whose program it shared."""
+        """The same result with the task of the chain, if the iteration ran in the program of a second-order scheme."""
         return self if self.task.first_order is None else self._replace(task=self.task.of_chain)
 
 

@@ -140,7 +140,7 @@ def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "As
     outflow = None
     if method.relaxes or undecided or assumptions.certificate is Certificate.OPEN:
         rate = fastest_rate(on) + on.problem.discount
-        outflow = jnp.where(rate > 0, rate, 1)  # it is a divisor, also where nothing moves
+        outflow = jnp.where(rate > 0, rate, 1)  # 1 where nothing moves, because the sweeps divide by it
     priced = assumptions.costs_certify and still is not None
     return Task(
         on, method, obstacles, jnp.ones(on.grid.shape, bool), still.least if priced and still else None, outflow,

@@ -349,7 +349,7 @@ def _backward_reach(held: np.ndarray, jumps: Rates, grid: Grid, clock: Clock) ->
 
 
 def _along_axes(jumps: Rates) -> dict[int, list[tuple[tuple[int, ...], np.ndarray]]]:
-    """For every axis the jumps along it, and along no earlier axis, as arrays with that axis in front."""
+    """The jumps grouped by the first axis along which they move, as arrays with that axis in front."""
     lines: dict[int, list] = {}
     for offset, jump in zip(jumps.offsets, jumps.values, strict=True):
         axis = next(axis for axis, step in enumerate(offset) if step)

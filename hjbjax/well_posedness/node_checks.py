@@ -193,7 +193,7 @@ def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock:
 
 @jax.jit
 def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar) -> Verdict:
-    """True without a fault under the actions first, …, last − 1; the first batch also checks functions of the state."""
+    """The verdict on the actions ``first``, …, ``last`` − 1; the first batch also checks functions of the state."""
     # functions of the state are checked once, with the first batch
     amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
     x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)

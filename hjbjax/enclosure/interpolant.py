@@ -19,9 +19,8 @@ from hjbjax.problem.grid import Grid
 from hjbjax.tracing.intervals import Interval, point
 from hjbjax.tracing.taylor_forms import Form
 
-Ends = Sequence[
-    tuple[np.ndarray, np.ndarray]
-]  # of a part of every unit cell along every axis: dyadic numbers, (count,)
+# for every axis the lower and the upper ends of parts of the unit cells, dyadic numbers, (count,)
+Ends = Sequence[tuple[np.ndarray, np.ndarray]]
 DEGREE = 2
 POINTS = DEGREE + 1
 SEAM = 2.0**-30  # by which half cells at the ends of a periodic axis overlap: more than their rounding

@@ -27,6 +27,8 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
+__all__ = ["evolve", "generator", "matrix", "stationary_density", "stationary_law", "transition_arrays"]
+
 
 @with_mode_axis()
 @with_settled_functions

@@ -98,7 +98,7 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
         # where the disturbance can keep the state from the target, V is infinite and the iteration never ends
         if forced is not None and not forced.all():
             task, reached = fewer, forced
-            # from the start, since the value so far is the result of that climb
+            # start again: the value so far comes from the endless iteration at these nodes
             state, code, residuals = iterate(task, warm(task, None, clock), clock)
     while code is Status.CONVERGED and may_go_on(task, assumptions, state, code):
         pays = _leaving_pays(task, state.value)

@@ -31,12 +31,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 def names_of(module):
     """The public names of a module, under the name where their module is."""
-    names = getattr(module, "__all__", None) or [
-        name
-        for name, thing in vars(module).items()
-        if not name.startswith("_") and callable(thing) and thing.__module__ == module.__name__
-    ]
-    return [f"{module.__name__}.{name}" for name in names if not name.startswith("__")]
+    return [f"{module.__name__}.{name}" for name in module.__all__ if not name.startswith("__")]
 
 
 MODULES = (hjb.zoo, hjb.filtering, hjb.neural, hjb.plotting, hjb.geometry, hjb.chain, hjb.stability, hjb.convex)

@@ -13,11 +13,12 @@ At a constrained end the first condition suffices for a lower bound.
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
-from hjbjax.enclosure.interpolant import SEAM, Cells, Ends, Spline
-from hjbjax.enclosure.minimum import Cell, cell_defect
+from hjbjax.enclosure.interpolant import SEAM, Cells, Spline
+from hjbjax.enclosure.minimum import Cell, Functions, cell_defect, functions
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing import intervals as iv
@@ -43,95 +44,96 @@ class Defects:
     policy: np.ndarray
 
 
-def defects(problem: Problem, grid: Grid, candidate: Spline, depth: int = 0) -> Defects:
-    """The defects over all cells, each cut into 2^depth parts along every axis.
+@dataclasses.dataclass(frozen=True)
+class CellBlock:
+    """Parts of some cells with the functions of the problem, which do not depend on W.
+
+    Attributes:
+      index: the number of each cell along every axis.
+      number: the number of parts of a cell.
+      cells: the parts.
+      known: the functions of the problem.
+      walls: the axes whose walls stop the paths, with the side of each part: −1 for the lower and 1 for the upper end.
+    """
+
+    index: Index
+    number: int
+    cells: Cells
+    known: Functions
+    walls: dict[int, np.ndarray]
+
+
+@quietly
+def blocks(problem: Problem, grid: Grid, spline: Spline, index: Index, depth: int) -> list[CellBlock]:
+    """Blocks of parts of some cells.
 
     Args:
       problem: a problem of one player with costs.
       grid: the grid.
-      candidate: W.
-      depth: the number of bisections.
+      spline: its cells.
+      index: the number of each cell along every axis.
+      depth: the number of bisections along every axis: each cell is cut into 2^depth parts along it.
     """
-    inputs = 0 if problem.controls is None else problem.controls.dim
-    found = Defects(
-        np.full(candidate.shape, np.inf), np.full(candidate.shape, -np.inf), np.zeros((*candidate.shape, inputs))
-    )
-    every = tuple(each.ravel() for each in np.meshgrid(*map(np.arange, candidate.shape), indexing="ij"))
-    _extend(problem, grid, candidate, every, depth, found)
-    return found
-
-
-def refine_cells(
-    problem: Problem, grid: Grid, candidate: Spline, found: Defects, chosen: np.ndarray, depth: int
-) -> Defects:
-    """The defects, with some cells cut into 2^depth parts along every axis.
-
-    Args:
-      problem: the problem.
-      grid: the grid.
-      candidate: W.
-      found: the defects so far.
-      chosen: the cells to cut, bool (*cells).
-      depth: the number of bisections.
-    """
-    index = np.nonzero(chosen)
-    cut = Defects(found.low.copy(), found.high.copy(), found.policy)
-    cut.low[index], cut.high[index] = np.inf, -np.inf
-    _extend(problem, grid, candidate, index, depth, cut)
-    # both enclose the same numbers
-    return Defects(np.maximum(cut.low, found.low), np.minimum(cut.high, found.high), found.policy)
-
-
-@quietly
-def _extend(problem: Problem, grid: Grid, candidate: Spline, index: Index, depth: int, total: Defects) -> None:
-    """Extend the bounds of some cells by the defects over their parts."""
-    pairs = zip(index, candidate.shape, strict=True)
+    pairs = zip(index, spline.shape, strict=True)
     sides = [np.where(i == 0, -1, np.where(i == cells - 1, 1, 0)) for i, cells in pairs]
-    inner = np.logical_and.reduce([side == 0 for side in sides])
-    # the coefficients of whole cells are used as they are; few cells are not worth a second evaluation
-    whole = inner & (depth == 0) & (len(inner) > BLOCK // 8)
-    for chosen, plain in ((whole, True), (~whole, False)):
-        own, at = tuple(each[chosen] for each in index), [each[chosen] for each in sides]
-        _over_blocks(problem, grid, candidate, own, at, depth, frozenset(), plain, total)
     projected = set(grid.sides("projected"))
     walls = [np.isin(side, [step for axis_, step in projected if axis_ == axis]) for axis, side in enumerate(sides)]
     walls = [wall & (side != 0) for wall, side in zip(walls, sides, strict=True)]
-    for count in range(1, grid.ndim + 1):
-        for stopped in itertools.combinations(range(grid.ndim), count):
-            chosen = np.logical_and.reduce([walls[axis] for axis in stopped])
-            own, at = tuple(each[chosen] for each in index), [each[chosen] for each in sides]
-            _over_blocks(problem, grid, candidate, own, at, depth, frozenset(stopped), False, total)
+    found = []
+    for stopped in itertools.chain.from_iterable(
+        itertools.combinations(range(grid.ndim), count) for count in range(grid.ndim + 1)
+    ):
+        chosen = np.logical_and.reduce([walls[axis] for axis in stopped]) if stopped else np.ones(len(index[0]), bool)
+        own, at = [each[chosen] for each in index], [each[chosen] for each in sides]
+        cut = [0 if axis in stopped else depth for axis in range(grid.ndim)]
+        number = 2 ** sum(cut)
+        step = max(1, BLOCK // number)
+        for first in range(0, len(own[0]), step):
+            some = slice(first, first + step)
+            block, side = tuple(i[some] for i in own), [each[some] for each in at]
+            parts = _parts(grid, side, cut, stopped)
+            cells = spline.cells([np.repeat(i, number) for i in block], parts)
+            x = tf.coordinates(cells.ranges, cells.centres, grid.ndim)
+            signs = {axis: np.repeat(side[axis], number) for axis in stopped}
+            found.append(CellBlock(block, number, cells, functions(problem, x, cells.radii), signs))
+    return found
 
 
-def _over_blocks(
-    problem: Problem, grid: Grid, candidate: Spline, index: Index, sides: list[np.ndarray], depth: int,
-    stopped: frozenset[int], whole: bool, total: Defects,
-) -> None:  # fmt: skip
-    """Extend the bounds of cells, in blocks.
+def all_cells(spline: Spline) -> Index:
+    """The numbers of all cells along every axis."""
+    return tuple(each.ravel() for each in np.meshgrid(*map(np.arange, spline.shape), indexing="ij"))
+
+
+@quietly
+def defects(spline: Spline, known: Sequence[CellBlock], values: np.ndarray, before: Defects | None = None) -> Defects:
+    """The defects over the cells of some blocks.
 
     Args:
-      problem, grid, candidate, index, depth, total: as for ``_extend``.
-      sides: for every axis −1 for a cell at the lower end, 1 at the upper end, and 0 elsewhere.
-      stopped: the axes whose walls the states are on.
-      whole: True for whole cells.
+      spline: the cells.
+      known: blocks.
+      values: the coefficients of W.
+      before: the defects so far, if the blocks do not contain all cells.
     """
-    cut = [0 if axis in stopped else depth for axis in range(grid.ndim)]
-    number = 2 ** sum(cut)
-    step = max(1, BLOCK // number)
-    for first in range(0, len(index[0]), step):
-        block, at = tuple(i[first : first + step] for i in index), [side[first : first + step] for side in sides]
-        every = tuple(np.repeat(i, number) for i in block)
-        ends = None if whole else _parts(grid, at, cut, stopped)
-        signs = {axis: np.repeat(at[axis], number) for axis in stopped}
-        found, policy = over_part(problem, candidate.cells(every), ends, signs)
-        low, high = (each.reshape(-1, number) for each in found.ends)
-        total.low[block] = np.minimum(total.low[block], low.min(axis=1))
-        total.high[block] = np.maximum(total.high[block], high.max(axis=1))
-        total.policy[block] = policy.reshape(-1, number, policy.shape[-1])[:, 0]
+    inputs = 0 if not known or known[0].known.problem.controls is None else known[0].known.problem.controls.dim
+    if before is None:
+        policy = np.zeros((*spline.shape, inputs))
+        before = Defects(np.full(spline.shape, -np.inf), np.full(spline.shape, np.inf), policy)
+    total = Defects(before.low.copy(), before.high.copy(), before.policy)
+    for block in known:
+        total.low[block.index], total.high[block.index] = np.inf, -np.inf
+    for block in known:
+        found, policy = over_block(block, values)
+        low, high = (each.reshape(-1, block.number) for each in found.ends)
+        total.low[block.index] = np.minimum(total.low[block.index], low.min(axis=1))
+        total.high[block.index] = np.maximum(total.high[block.index], high.max(axis=1))
+        if not block.walls:
+            total.policy[block.index] = policy.reshape(-1, block.number, policy.shape[-1])[:, 0]
+    # both enclose the same numbers
+    return Defects(np.maximum(total.low, before.low), np.minimum(total.high, before.high), total.policy)
 
 
 def _parts(
-    grid: Grid, sides: list[np.ndarray], depths: list[int], stopped: frozenset[int]
+    grid: Grid, sides: list[np.ndarray], depths: list[int], stopped: Sequence[int]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """The ends of all parts of all cells, the parts of one cell after each other."""
     counts = [2**depth for depth in depths]
@@ -152,30 +154,25 @@ def _parts(
     return found
 
 
-def over_part(
-    problem: Problem, cells: Cells, ends: Ends | None, walls: dict[int, np.ndarray]
-) -> tuple[Interval, np.ndarray]:
-    """Bounds of (β W − H)/β over a part of some cells, and a control.
+def over_block(block: CellBlock, values: np.ndarray) -> tuple[Interval, np.ndarray]:
+    """Bounds of (β W − H)/β over parts of some cells, and a control.
 
     Args:
-      problem: the problem.
-      cells: the cells.
-      ends: the parts of the unit cells; ``None`` is the whole of them.
-      walls: the axes whose walls stop the paths, with the side of each cell: −1 for the lower and 1 for the upper end.
+      block: the parts.
+      values: the coefficients of W.
     """
-    boxes, centres, radii = cells.boxes(ends)
-    w, p = cells.scalars(ends)
-    n, every = len(boxes), frozenset(walls)
-    found = cell_defect(problem, Cell(tf.coordinates(boxes, centres, n), radii, w, p), [every] if walls else [])
+    w, p = block.cells.scalars(values)
+    every = frozenset(block.walls)
+    found = cell_defect(Cell(block.known, w, p), [every] if every else [])
     low, high = found.defect.ends
     rises = np.ones(np.shape(low), bool)
-    for axis, side in walls.items():
-        slope = p[axis].bounds(radii)
+    for axis, side in block.walls.items():
+        slope = p[axis].bounds(block.cells.radii)
         outward, speed = (iv.where(side > 0, each, -each) for each in (slope, found.drift[axis]))
         rises &= outward.hi > 0
         loss = point(np.maximum(speed.hi, 0.0)) * point(np.maximum(-outward.lo, 0.0))
         low = (point(low) - loss).lo
-    if walls:
+    if every:
         high = np.where(rises, np.maximum(high, found.least[every]), high)
     # β is positive
     ratios = [point(each) / found.rate for each in (np.minimum(low, high), high)]

@@ -9,14 +9,15 @@ import jax
 import numpy as np
 
 from hjbjax.enclosure import correction, defect, walls
-from hjbjax.enclosure.defect import Defects
-from hjbjax.enclosure.interpolant import AxisTable, Spline, axis_table
+from hjbjax.enclosure.defect import CellBlock, Defects
+from hjbjax.enclosure.interpolant import Spline, axis_table
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import REWARD
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted, is_random
 from hjbjax.problem.pytree import front_door, is_traced
 from hjbjax.problem.rewards import costs_of
+from hjbjax.problem.sets import Finite
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import in_unit_box
 from hjbjax.problem.types import Numbers
@@ -30,8 +31,9 @@ from hjbjax.tracing.operations import operations
 from hjbjax.tracing.taylor_forms import traced
 
 SMOOTHING = 3  # defect corrections before the bounds part
-WIDENED = 3.0  # the level of a correction is the largest defect divided by this number
+WIDENED = 5.0  # the level of a correction is the largest defect divided by this number
 FALLS = 0.7  # a defect correction must reduce the mean defect to this fraction
+HELPS = 0.6  # a correction along the paths that leaves more than this fraction of the shift is compared with another
 STAGNANT = 2  # corrections without progress after which a bound is given up
 BISECTIONS = 2  # of the cells with the largest defects
 LARGEST = 0.5  # fraction of the largest defect from which on a cell is bisected
@@ -88,11 +90,13 @@ def enclose(
     needed = memory.fitting(_peak_bytes(own, grid), grid, max_memory)
     scale = float(np.ptp(value)) or 1.0
     with own_settings(x64=True):
-        task = _Task(own, grid, tuple(axis_table(grid, axis) for axis in range(grid.ndim)), scale * tol)
+        spline = Spline(tuple(axis_table(grid, axis) for axis in range(grid.ndim)))
+        known = defect.blocks(own, grid, spline, defect.all_cells(spline), 0)
+        task = _Task(own, grid, spline, known, scale * tol)
         middle, found = task.corrected(value)
         lower = task.bound(middle, found, 1, count)
         upper = task.bound(middle, found, -1, count)
-        remaining = walls.remaining(own, grid, Spline(task.tables, value))
+        remaining = walls.remaining(own, grid, spline)
     if problem.payoff == REWARD:
         lower, upper = upper.negative(), lower.negative()
     nodes = grid.nodes().reshape(-1, grid.ndim)
@@ -110,22 +114,22 @@ class Bound:
     """One bound: the best of several shifted splines.
 
     Attributes:
-      tables: the cells along every axis.
+      spline: the cells of the grid.
       coefficients: of every spline, each (*grid).
       shifts: the numbers that are subtracted from a lower bound, or added to an upper bound.
       sign: 1 for a lower and −1 for an upper bound.
     """
 
-    tables: tuple[AxisTable, ...]
+    spline: Spline
     coefficients: tuple[np.ndarray, ...]
     shifts: tuple[float, ...]
     sign: int
 
     def at(self, states: np.ndarray) -> np.ndarray:
         """The bound at states (count, n) inside the box, rounded to its side."""
-        best = np.full(len(states), -self.sign * np.inf)
+        best, places = np.full(len(states), -self.sign * np.inf), self.spline.at(states)
         for values, shift in zip(self.coefficients, self.shifts, strict=True):
-            found = Spline(self.tables, values).at(states)
+            found = places.values(values)
             if self.sign > 0:
                 best = np.maximum(best, (found - point(shift)).lo)
             else:
@@ -134,7 +138,7 @@ class Bound:
 
     def negative(self) -> "Bound":
         """Minus the bound, which is a bound from the other side."""
-        return Bound(self.tables, tuple(-each for each in self.coefficients), self.shifts, -self.sign)
+        return Bound(self.spline, tuple(-each for each in self.coefficients), self.shifts, -self.sign)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -209,18 +213,20 @@ class _Task:
     Attributes:
       problem: a problem of one player with costs.
       grid: the grid.
-      tables: the cells along every axis.
+      spline: the cells of the grid.
+      known: the functions of the problem over all cells.
       wanted: the width at which corrections stop, in cost units.
     """
 
     problem: Problem
     grid: Grid
-    tables: tuple[AxisTable, ...]
+    spline: Spline
+    known: list[CellBlock]
     wanted: float
 
     def defects(self, values: np.ndarray) -> Defects:
         """The defects of the spline with these coefficients."""
-        return defect.defects(self.problem, self.grid, Spline(self.tables, values))
+        return defect.defects(self.spline, self.known, values)
 
     def move(self, found: Defects, source: np.ndarray) -> np.ndarray:
         """The correction of the coefficients by a source at the nodes."""
@@ -239,6 +245,10 @@ class _Task:
 
     def corrected(self, values: np.ndarray) -> tuple[np.ndarray, Defects]:
         """The coefficients after defect corrections, as long as the mean defect falls, and their defects."""
+        nodes = self.grid.nodes().reshape(-1, self.grid.ndim)
+        # a spline with the node values as its coefficients is too smooth
+        smoothed = self.spline.at(nodes).values(values).lo.reshape(self.grid.shape)
+        values = 2 * values - smoothed
         found = self.defects(values)
         for _ in range(SMOOTHING):
             middle = (found.low + found.high) / 2
@@ -260,46 +270,58 @@ class _Task:
         kept: list[tuple[np.ndarray, float]] = []
         best, stagnant = np.full(self.grid.shape, -np.inf), 0
         for _ in range(rounds):
-            found = self.bisected(values, found, sign)
-            sizes = found.high if sign > 0 else -found.low
+            lead = self.lead(values, kept, sign)
+            found = self.bisected(values, found, lead, sign)
+            sizes = np.minimum(found.high if sign > 0 else -found.low, lead)
             shift = float(np.max(sizes))
             if not np.isfinite(shift):
                 break
             before = np.mean(best)
-            better = sign * values - shift > best
             best = np.maximum(best, sign * values - shift)
-            if np.any(better):
-                kept.append((values, shift))
+            kept.append((values, shift))
             # progress is measured by the part of the width that one more correction may win
             gain = np.mean(best) - before
             stagnant = 0 if gain > (1 - GAIN) * max(shift, self.wanted) else stagnant + 1
             if shift <= self.wanted / 4 or stagnant >= STAGNANT:
                 break
             excess = correction.on_nodes(np.maximum(sizes - shift / WIDENED, 0), self.grid)
-            values, found = self.better(values, found, excess, sign)
+            values, found = self.better(values, found, excess, kept, sign)
         if not kept:
             raise ValueError(_no_bound(self.grid, found, sign))
-        return Bound(self.tables, tuple(each for each, _ in kept), tuple(shift for _, shift in kept), sign)
+        return Bound(self.spline, tuple(each for each, _ in kept), tuple(shift for _, shift in kept), sign)
 
-    def better(self, values: np.ndarray, found: Defects, excess: np.ndarray, sign: int) -> tuple[np.ndarray, Defects]:
-        """The better of two corrections for an excess at the nodes, and its defects.
+    def lead(self, values: np.ndarray, kept: list[tuple[np.ndarray, float]], sign: int) -> np.ndarray:
+        """The shift from which on a candidate is nowhere in a cell better than the bounds so far, shape (*cells)."""
+        found = np.full(self.spline.shape, np.inf)
+        for other, shift in kept:
+            found = np.minimum(found, (point(self.spline.largest(sign * (values - other))) + point(shift)).hi)
+        return found
 
-        One follows the paths. The other is a bump at the nodes themselves: at a kink that paths leave, the spline has
-        an extremum, where the motion does not count and W must be the value of resting there.
+    def better(
+        self, values: np.ndarray, found: Defects, excess: np.ndarray, kept: list[tuple[np.ndarray, float]], sign: int
+    ) -> tuple[np.ndarray, Defects]:
+        """A correction for an excess at the nodes, and its defects.
+
+        It follows the paths. If this does not help, the better of it and of a bump at the nodes themselves: at a kink
+        that paths leave, the spline has an extremum, where the motion does not count and W must be the value of resting
+        there.
         """
-        moves = [self.move(found, correction.smooth_cover(excess, self.grid)), excess]
-        options = [values - sign * move for move in moves]
-        after = [self.defects(each) for each in options]
+        options: list[tuple[float, np.ndarray, Defects]] = []
+        for move in (lambda: self.move(found, correction.smooth_cover(excess, self.grid)), lambda: excess):
+            option = values - sign * move()
+            after = self.defects(option)
+            sizes = np.minimum(after.high if sign > 0 else -after.low, self.lead(option, kept, sign))
+            shift = float(np.max(sizes))
+            options.append((float(np.mean(sign * option)) - shift, option, after))
+            if shift < HELPS * kept[-1][1]:
+                break
+        _, option, after = max(options, key=lambda each: each[0])
+        return option, after
 
-        def bound(option: np.ndarray, found: Defects) -> float:
-            return float(np.mean(sign * option) - np.max(found.high if sign > 0 else -found.low))
-
-        return max(zip(options, after, strict=True), key=lambda pair: bound(*pair))
-
-    def bisected(self, values: np.ndarray, found: Defects, sign: int) -> Defects:
-        """The defects with the cells of the largest ones cut into parts, at most one in ten."""
+    def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
+        """The defects with the cells that determine the shift cut into parts, at most one in ten."""
         for depth in range(1, BISECTIONS + 1):
-            sizes = found.high if sign > 0 else -found.low
+            sizes = np.minimum(found.high if sign > 0 else -found.low, lead)
             if not np.all(np.isfinite(sizes)):
                 break
             level = max(LARGEST * np.max(sizes), np.quantile(sizes, 0.9))
@@ -308,7 +330,8 @@ class _Task:
             chosen &= found.high - found.low > 0.2 * np.abs(sizes)
             if not np.any(chosen):
                 break
-            found = defect.refine_cells(self.problem, self.grid, Spline(self.tables, values), found, chosen, depth)
+            parts = defect.blocks(self.problem, self.grid, self.spline, np.nonzero(chosen), depth)
+            found = defect.defects(self.spline, parts, values, found)
         return found
 
 
@@ -352,15 +375,19 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
 
 
 def _peak_bytes(problem: Problem, grid: Grid) -> int:
-    """Bytes that ``enclose`` uses at its peak: all scalars of one block of cells, and the factors of the chain."""
+    """Bytes that ``enclose`` uses at its peak: all scalars of one block of cells, and per node the weights of the
+    spline, the functions of the problem and the factors of the chain."""
     n, m = grid.ndim, 0 if problem.controls is None else problem.controls.dim
     arguments = ([0.0] * n, [0.0] * m)
     counts = [operations(traced(each, *arguments)) for each in (problem.drift, problem.cost) if each is not None]
     scalars = 60 + sum(each.single + each.whole for each in counts)
     # range, centre, slopes, gradient and second derivatives, each with two bounds
-    block = 8 * min(grid.size, defect.BLOCK) * 2 * (2 + 2 * n + n * (n + 1) // 2) * scalars
+    each = 8 * 2 * (2 + 2 * n + n * (n + 1) // 2)
+    block = each * min(grid.size, defect.BLOCK) * scalars
+    terms = len(problem.controls.points) if isinstance(problem.controls, Finite) else m + 1
+    known = each * (2 + (n + 1) * terms) + 8 * 27 * n
     fill = 31 * np.log2(grid.size + 2) if n <= correction.DIRECT else 20
-    return int(block + grid.size * (12 * fill + 8 * 30))
+    return int(block + grid.size * (12 * fill + 8 * 30 + known))
 
 
 def _message(grid: Grid, share: float, tol: float) -> str:

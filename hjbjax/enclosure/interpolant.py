@@ -6,6 +6,8 @@ divided by their distance, so the slope everywhere is between differences of nei
 the spline does not overshoot. Beyond an end the coefficients continue as a parabola.
 
 A polynomial is between the least and the largest of its Bézier coefficients (C. de Boor, A Practical Guide to Splines).
+They are sums of products of node values and known weights, one weight per axis. The sums are computed in float64, and a
+bound of their rounding errors is added: the largest node value times a number that depends only on the grid.
 """
 
 import dataclasses
@@ -16,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hjbjax.problem.grid import Grid
-from hjbjax.tracing.intervals import Interval, point
+from hjbjax.tracing.intervals import EPS, Interval, point
 from hjbjax.tracing.taylor_forms import Form
 
 # for every axis the lower and the upper ends of parts of the unit cells, dyadic numbers, (count,)
@@ -24,6 +26,22 @@ Ends = Sequence[tuple[np.ndarray, np.ndarray]]
 DEGREE = 2
 POINTS = DEGREE + 1
 SEAM = 2.0**-30  # by which half cells at the ends of a periodic axis overlap: more than their rounding
+ROUNDING = 64 * EPS  # relative, of a weight on a part of a cell, and of the sum over the nodes along one axis
+
+
+@dataclasses.dataclass(frozen=True)
+class AxisWeights:
+    """The Bézier coefficients of one derivative along one axis, as sums over three nodes.
+
+    Attributes:
+      rows: the weights, shape (3 − order, 3, cells).
+      size: the largest sum of the absolute weights of a coefficient, shape (cells,).
+      error: a bound of the error of a sum of three terms with absolute value at most one, shape (cells,).
+    """
+
+    rows: np.ndarray
+    size: np.ndarray
+    error: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +54,7 @@ class AxisTable:
       lower: the lower end of every cell.
       lengths: the length of every cell.
       nodes: the three nodes whose coefficients determine each cell, shape (cells, 3).
-      weights: their weights in the three Bézier coefficients, shape (cells, 3, 3).
+      weights: of the derivatives of order 0, 1 and 2.
     """
 
     periodic: bool
@@ -44,7 +62,7 @@ class AxisTable:
     lower: Interval
     lengths: Interval
     nodes: np.ndarray
-    weights: Interval
+    weights: tuple[AxisWeights, ...]
 
 
 def axis_table(grid: Grid, axis: int) -> AxisTable:
@@ -72,7 +90,7 @@ def axis_table(grid: Grid, axis: int) -> AxisTable:
     else:
         nodes = np.clip(index, 0, count - 1)
         _extrapolate(weights, nodes, count)
-    return AxisTable(cyclic, between, point(at) - below, lengths, nodes, weights)
+    return AxisTable(cyclic, between, point(at) - below, lengths, nodes, _derivatives(weights, lengths))
 
 
 def _extrapolate(weights: Interval, nodes: np.ndarray, count: int) -> None:
@@ -91,6 +109,20 @@ def _extrapolate(weights: Interval, nodes: np.ndarray, count: int) -> None:
             getattr(weights, kind)[cell] = [[getattr(each, kind) for each in row] for row in rows]
 
 
+def _derivatives(weights: Interval, lengths: Interval) -> tuple[AxisWeights, ...]:
+    """The weights (cells, 3, 3) of the Bézier coefficients, and those of the first and second derivative."""
+    found, length = [], _take(lengths, (slice(None), None, None))
+    for order in range(POINTS):
+        if order:
+            difference = _take(weights, np.s_[:, 1:]) - _take(weights, np.s_[:, :-1])
+            weights = difference.scaled(POINTS - order) / length
+        middle = (weights.lo + weights.hi) / 2
+        size = np.abs(middle).sum(axis=2).max(axis=1)
+        error = (weights.hi - weights.lo).sum(axis=2).max(axis=1) + ROUNDING * size
+        found.append(AxisWeights(np.moveaxis(middle, 0, -1), size, error))
+    return tuple(found)
+
+
 def _take(x: Interval, index: Any) -> Interval:
     return Interval(x.lo[index], x.hi[index])
 
@@ -105,169 +137,209 @@ def _put(weights: Interval, row: int, columns: Sequence[Interval | None]) -> Non
             weights.lo[:, row, k], weights.hi[:, row, k] = column.ends
 
 
-@dataclasses.dataclass(frozen=True)
-class Spline:
-    """The function with some coefficients.
-
-    Attributes:
-      tables: one per axis.
-      values: the coefficients, shape (*grid).
-    """
-
-    tables: tuple[AxisTable, ...]
-    values: np.ndarray
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The number of cells along every axis."""
-        return tuple(len(table.lengths.lo) for table in self.tables)
-
-    def cells(self, index: tuple[np.ndarray, ...]) -> "Cells":
-        """The polynomials of some cells.
-
-        Args:
-          index: the number of each cell along every axis, one array (count,) per axis.
-        """
-        n = len(self.tables)
-        pairs = list(zip(self.tables, index, strict=True))
-        stencil = tuple(
-            table.nodes[i].reshape(-1, *(1,) * axis, POINTS, *(1,) * (n - 1 - axis))
-            for axis, (table, i) in enumerate(pairs)
-        )
-        values = self.values[stencil]
-        found = Interval(values, values)
-        for axis, (table, i) in enumerate(pairs):
-            found = _contract(_take(table.weights, i), found, axis + 1)
-        return Cells(
-            found, [_take(table.lengths, i) for table, i in pairs], [_take(table.lower, i) for table, i in pairs]
-        )
-
-    def at(self, states: np.ndarray) -> Interval:
-        """The function at some states inside the box, shape (count, n)."""
-        index = tuple(
-            np.searchsorted(table.between, states[:, axis], side="right") for axis, table in enumerate(self.tables)
-        )
-        cells = self.cells(index)
-        found = cells.coefficients
-        for axis in reversed(range(len(self.tables))):
-            place = (point(states[:, axis]) - cells.lower[axis]) / cells.lengths[axis]
-            fill = (slice(None), *(None,) * (axis + 1))  # the axes before this one, and the coefficients along it
-            t = Interval(place.lo[fill], place.hi[fill])
-            rest = point(1.0) - t
-            while found.lo.shape[-1] > 1:  # de Casteljau's algorithm
-                found = rest * _take(found, (..., slice(None, -1))) + t * _take(found, (..., slice(1, None)))
-            found = _take(found, (..., 0))
-        return found
+def _mixed(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """One step of de Casteljau's algorithm for one place in every cell, or for one place in all."""
+    return (1 - place) * rows[:-1] + place * rows[1:]
 
 
-def _contract(matrix: Interval, values: Interval, axis: int) -> Interval:
-    """The product of one matrix (count, r, s), or (r, s), with values (count, ..., s, ...) along an axis."""
-    lo, hi = (np.moveaxis(end, axis, -1) for end in values.ends)
-    fill = (slice(None),) * (matrix.lo.ndim - 2) + (None,) * (lo.ndim - 1 - (matrix.lo.ndim - 2))
-    total: Interval | None = None
-    for s in range(matrix.lo.shape[-1]):
-        column = Interval(matrix.lo[..., s][fill], matrix.hi[..., s][fill])
-        term = column * Interval(lo[..., s, None], hi[..., s, None])
-        total = term if total is None else total + term
-    assert total is not None
-    return Interval(np.moveaxis(total.lo, -1, axis), np.moveaxis(total.hi, -1, axis))
-
-
-def _at(places: np.ndarray, found: Interval, axis: int) -> Interval:
-    """One step of de Casteljau's algorithm along an axis, for one place in every unit cell."""
-    lo, hi = (np.moveaxis(end, axis, -1) for end in found.ends)
-    fill = (slice(None), *(None,) * (lo.ndim - 1))
-    t = point(places[fill])
-    mixed = point(1 - places[fill]) * Interval(lo[..., :-1], hi[..., :-1]) + t * Interval(lo[..., 1:], hi[..., 1:])
-    return Interval(*(np.moveaxis(end, -1, axis) for end in mixed.ends))
-
-
-def _restricted(found: Interval, axis: int, ends: tuple[np.ndarray, np.ndarray]) -> Interval:
-    """The Bézier coefficients over a part of every cell along one axis."""
-    degree = found.lo.shape[axis] - 1
+def _restricted(rows: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+    """The weights of the Bézier coefficients over a part of every cell."""
+    degree = len(rows) - 1
     # the k-th coefficient is the blossom at degree − k times the lower and k times the upper end
     columns = []
     for k in range(degree + 1):
-        blossom = found
-        for place in (ends[0],) * (degree - k) + (ends[1],) * k:
-            blossom = _at(place, blossom, axis)
+        blossom = rows
+        for place in (start,) * (degree - k) + (stop,) * k:
+            blossom = _mixed(blossom, place)
         columns.append(blossom)
-    return Interval(*(np.concatenate([each.ends[k] for each in columns], axis=axis) for k in range(2)))
+    return np.concatenate(columns)
+
+
+def _contracted(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The sums over the first axis of values (3, ..., count) with weights (r, 3, count): shape (..., r, count)."""
+    fill = (slice(None), *(None,) * (values.ndim - 2), slice(None))
+    total = rows[:, 0][fill] * values[0]
+    for k in range(1, POINTS):
+        total += rows[:, k][fill] * values[k]
+    return np.moveaxis(total, 0, -2)
 
 
 @dataclasses.dataclass(frozen=True)
 class Cells:
-    """The polynomials of some cells.
+    """Parts of some cells, for any coefficients of the spline.
 
     Attributes:
-      coefficients: the Bézier coefficients, shape (count, 3, ..., 3).
-      lengths: the lengths of the cells along every axis, each (count,).
-      lower: the lower ends of the cells along every axis, each (count,).
+      stencil: the index of the nodes of every cell, one array per axis; together of shape (3, ..., 3, count).
+      rows: per axis and order of the derivative, the weights of the coefficients over the part, (3 − order, 3, count).
+      middles: the same for the value at the centre of the part, (1, 3, count).
+      weights: per axis and order, ``size`` and ``error`` of the cells, both (count,).
+      ranges: the range of every coordinate.
+      centres: the centre of every coordinate.
+      radii: the largest distance from the centre along every axis.
     """
 
-    coefficients: Interval
-    lengths: Sequence[Interval]
-    lower: Sequence[Interval]
+    stencil: tuple[np.ndarray, ...]
+    rows: list[list[np.ndarray]]
+    middles: list[list[np.ndarray]]
+    weights: list[list[tuple[np.ndarray, np.ndarray]]]
+    ranges: list[Interval]
+    centres: list[Interval]
+    radii: list[np.ndarray]
 
-    def derivative(self, orders: Sequence[int], ends: Ends | None) -> tuple[Interval, Interval]:
-        """The range of a derivative over a part of the cells, and its value at the centre of the part.
+    def scalars(self, values: np.ndarray) -> tuple[Form, list[Form]]:
+        """The spline and its gradient.
 
         Args:
-          orders: the order along every axis.
-          ends: the parts of the unit cells; ``None`` is the whole of them.
+          values: the coefficients of the spline, shape (*grid).
         """
-        found = self.coefficients
-        if max(orders) > DEGREE:
-            zero = np.zeros(len(found.lo))
-            return Interval(zero, zero), Interval(zero, zero)
-        for axis, order in enumerate(orders):
-            for k in range(order):
-                lo, hi = (np.moveaxis(end, axis + 1, -1) for end in found.ends)
-                difference = Interval(lo[..., 1:], hi[..., 1:]) - Interval(lo[..., :-1], hi[..., :-1])
-                found = Interval(*(np.moveaxis(end, -1, axis + 1) for end in difference.ends))
-                fill = (slice(None), *(None,) * (found.lo.ndim - 1))
-                found = found.scaled(DEGREE - k) / _take(self.lengths[axis], fill)
-        centre = found
-        for axis, order in enumerate(orders):
-            middle = np.full(len(found.lo), 0.5) if ends is None else (ends[axis][0] + ends[axis][1]) / 2
-            for _ in range(DEGREE - order):
-                centre = _at(middle, centre, axis + 1)
-            if ends is not None and order < DEGREE:
-                found = _restricted(found, axis + 1, ends[axis])
-        axes = tuple(range(1, found.lo.ndim))
-        at_centre = Interval(centre.lo.reshape(len(centre.lo)), centre.hi.reshape(len(centre.hi)))
-        return Interval(found.lo.min(axis=axes), found.hi.max(axis=axes)), at_centre
-
-    def boxes(self, ends: Ends | None) -> tuple[list[Interval], list[Interval], list[np.ndarray]]:
-        """Boxes that contain a part of the cells, their centres, and the largest distance from it along every axis."""
-        ranges, centres, radii = [], [], []
-        for axis, (lower, lengths) in enumerate(zip(self.lower, self.lengths, strict=True)):
-            start, stop = (np.zeros(()), np.ones(())) if ends is None else ends[axis]
-            low, high, middle = (lower + lengths * point(t) for t in (start, stop, (start + stop) / 2))
-            box = Interval(low.lo, high.hi)
-            ranges.append(box)
-            centres.append(middle)
-            radii.append(np.nextafter(np.maximum(box.hi - middle.lo, middle.hi - box.lo), np.inf))
-        return ranges, centres, radii
-
-    def scalars(self, ends: Ends | None) -> tuple[Form, list[Form]]:
-        """The function and its gradient over a part of the cells."""
-        n = len(self.lengths)
-
-        def of(*axes: int) -> tuple[Interval, Interval]:
-            return self.derivative([axes.count(axis) for axis in range(n)], ends)
-
-        def table(order: int) -> dict[tuple[int, ...], tuple[Interval, Interval]]:
-            return {axes: of(*axes) for axes in itertools.combinations_with_replacement(range(n), order)}
-
-        first, second, third = table(1), table(2), table(3)
+        n, found = len(self.rows), self._derivatives(values)
 
         def form(*axes: int) -> Form:
             """A derivative of order zero or one, with its own first and second derivatives."""
             own = [tuple(sorted((*axes, i))) for i in range(n)]
-            lower, upper = (first, second) if not axes else (second, third)
-            curvature = {(i, j): upper[tuple(sorted((*axes, i, j)))][0] for i in range(n) for j in range(i, n)}
-            value = of() if not axes else first[axes]
-            return Form(*value, tuple(lower[each][0] for each in own), tuple(lower[each][1] for each in own), curvature)
+            pairs = itertools.combinations_with_replacement(range(n), 2)
+            curvature = {(i, j): found[tuple(sorted((*axes, i, j)))][0] for i, j in pairs}
+            slopes, gradient = (tuple(found[each][k] for each in own) for k in range(2))
+            return Form(*found[axes], slopes, gradient, curvature)
 
         return form(), [form(i) for i in range(n)]
+
+    def _derivatives(self, values: np.ndarray) -> dict[tuple[int, ...], tuple[Interval, Interval]]:
+        """Per list of axes, at most three, the range of the derivative and its value at the centre."""
+        n, largest = len(self.rows), float(np.max(np.abs(values)))
+        found: dict[tuple[int, ...], tuple[Interval, Interval]] = {}
+
+        def walk(axis: int, orders: tuple[int, ...], whole: np.ndarray, middle: np.ndarray) -> None:
+            if axis == n:
+                whole, middle = whole.reshape(-1, whole.shape[-1]), middle.reshape(-1)
+                error = largest * self._error(orders)
+                axes = tuple(k for k, order in enumerate(orders) for _ in range(order))
+                ranges = Interval(whole.min(axis=0) - error, whole.max(axis=0) + error)
+                found[axes] = ranges, Interval(middle - error, middle + error)
+                return
+            for order in range(min(POINTS, 4 - sum(orders))):
+                rows, middles = self.rows[axis][order], self.middles[axis][order]
+                walk(axis + 1, (*orders, order), _contracted(rows, whole), _contracted(middles, middle))
+
+        stencil = values[self.stencil]
+        walk(0, (), stencil, stencil)
+        zero = np.zeros(())
+        for axis in range(n):
+            found[axis, axis, axis] = (Interval(zero, zero),) * 2
+        return found
+
+    def _error(self, orders: Sequence[int]) -> np.ndarray:
+        """A bound of the error of a coefficient of a derivative for node values up to one, shape (count,)."""
+        pairs = [self.weights[axis][order] for axis, order in enumerate(orders)]
+        total, share = np.ones(()), np.zeros(())
+        for size, error in pairs:
+            total, share = total * size, share + error / size
+        return 2 * total * share  # the product of (1 + shares) is less than 1 plus twice their sum
+
+
+@dataclasses.dataclass(frozen=True)
+class Spline:
+    """The cells of a grid.
+
+    Attributes:
+      tables: one per axis.
+    """
+
+    tables: tuple[AxisTable, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of cells along every axis."""
+        return tuple(len(table.between) + 1 for table in self.tables)
+
+    def _stencil(self, index: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+        n = len(self.tables)
+        return tuple(
+            table.nodes[i].T.reshape(*(1,) * axis, POINTS, *(1,) * (n - 1 - axis), -1)
+            for axis, (table, i) in enumerate(zip(self.tables, index, strict=True))
+        )
+
+    def cells(self, index: Sequence[np.ndarray], ends: Ends | None = None) -> Cells:
+        """Parts of some cells.
+
+        Args:
+          index: the number of each cell along every axis, one array (count,) per axis.
+          ends: the parts of the unit cells; ``None`` is the whole of them.
+        """
+        whole = np.zeros(()), np.ones(())
+        found = Cells(self._stencil(index), [], [], [], [], [], [])
+        for axis, (table, i) in enumerate(zip(self.tables, index, strict=True)):
+            start, stop = whole if ends is None else ends[axis]
+            middle = (start + stop) / 2
+            rows = [each.rows[..., i] for each in table.weights]
+            found.rows.append(rows if ends is None else [_restricted(each, start, stop) for each in rows])
+            centre = []
+            for each in rows:
+                while len(each) > 1:
+                    each = _mixed(each, middle)
+                centre.append(each)
+            found.middles.append(centre)
+            found.weights.append([(each.size[i], each.error[i]) for each in table.weights])
+            lower, lengths = _take(table.lower, i), _take(table.lengths, i)
+            low, high, place = (lower + lengths * point(t) for t in (start, stop, middle))
+            box = Interval(low.lo, high.hi)
+            found.ranges.append(box)
+            found.centres.append(place)
+            found.radii.append(np.nextafter(np.maximum(box.hi - place.lo, place.hi - box.lo), np.inf))
+        return found
+
+    def largest(self, values: np.ndarray) -> np.ndarray:
+        """An upper bound of the spline with some coefficients in every cell inside the box, shape (*cells)."""
+        n, error, size = len(self.tables), np.zeros(()), np.full((), float(np.max(np.abs(values))))
+        found = values[None]
+        for axis, table in enumerate(self.tables):
+            weights, start, stop = table.weights[0], *(np.full(len(table.nodes), end) for end in (0.0, 1.0))
+            if not table.periodic:
+                start[0] = stop[-1] = 0.5
+            rows = _restricted(weights.rows, start, stop)
+            around = [np.moveaxis(found, axis + 1, -1)[..., k] for k in table.nodes.T]
+            parts = [sum(row[k] * around[k] for k in range(POINTS)) for row in rows]
+            found = np.moveaxis(np.concatenate(parts), -1, axis + 1)
+            fill = (slice(None), *(None,) * (n - 1 - axis))
+            error, size = error + (weights.error / weights.size)[fill], size * weights.size[fill]
+        return found.max(axis=0) + 2 * size * error
+
+    def at(self, states: np.ndarray) -> "States":
+        """The spline at some states inside the box, shape (count, n), for any coefficients."""
+        rows, size, error = [], np.ones(()), np.zeros(())
+        index = [np.searchsorted(table.between, states[:, k], side="right") for k, table in enumerate(self.tables)]
+        for axis, (table, i) in enumerate(zip(self.tables, index, strict=True)):
+            weights, slope = table.weights[:2]
+            place = (point(states[:, axis]) - _take(table.lower, i)) / _take(table.lengths, i)
+            middle, row = (place.lo + place.hi) / 2, weights.rows[..., i]
+            while len(row) > 1:
+                row = _mixed(row, middle)
+            # outside [0, 1] by rounding, where the weights are hardly larger
+            moved = slope.size[i] * table.lengths.hi[i] * (place.hi - place.lo)
+            rows.append(row)
+            error = error + (weights.error[i] + 2 * moved) / weights.size[i]
+            size = size * weights.size[i]
+        return States(self._stencil(index), rows, 2 * size * error)
+
+
+@dataclasses.dataclass(frozen=True)
+class States:
+    """Some states, for any coefficients of the spline.
+
+    Attributes:
+      stencil: the index of the nodes around every state, as in ``Cells``.
+      rows: per axis the weights of the nodes, (1, 3, count).
+      error: a bound of the error for node values up to one, shape (count,).
+    """
+
+    stencil: tuple[np.ndarray, ...]
+    rows: list[np.ndarray]
+    error: np.ndarray
+
+    def values(self, coefficients: np.ndarray) -> Interval:
+        """The spline with these coefficients, shape (*grid), at the states."""
+        found = coefficients[self.stencil]
+        for row in self.rows:
+            found = _contracted(row, found)
+        found, error = found.reshape(-1), float(np.max(np.abs(coefficients))) * self.error
+        return Interval(found - error, found + error)

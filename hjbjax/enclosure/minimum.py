@@ -8,6 +8,7 @@ be affine, or c|u|² plus an affine function, and over a simplex affine. In othe
 the control is one more coordinate of the cells.
 """
 
+import contextlib
 import dataclasses
 import itertools
 from collections.abc import Sequence
@@ -28,18 +29,36 @@ Actions = list[Interval]  # the range of every input
 
 
 @dataclasses.dataclass(frozen=True)
+class Functions:
+    """The functions of a problem over parts of cells.
+
+    Attributes:
+      problem: a problem of one player with costs.
+      x: the state.
+      radii: the largest distance from the centre along every axis.
+      rate: the discount.
+      options: cost and drift as polynomials of the control, or for every action of a finite set; empty if they are not
+        quadratic polynomials.
+    """
+
+    problem: Problem
+    x: list[Form]
+    radii: list[np.ndarray]
+    rate: Form
+    options: list[tuple[qu.Polynomial, list[qu.Polynomial]]]
+
+
+@dataclasses.dataclass(frozen=True)
 class Cell:
     """A candidate W over parts of cells.
 
     Attributes:
-      x: the state.
-      radii: the largest distance from the centre along every axis.
+      functions: the functions of the problem.
       w: the candidate.
       p: its gradient.
     """
 
-    x: list[Form]
-    radii: list[np.ndarray]
+    functions: Functions
     w: Form
     p: list[Form]
 
@@ -63,47 +82,66 @@ class CellDefect:
     policy: np.ndarray
 
 
-def cell_defect(problem: Problem, cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
-    """The defect of a candidate.
+def functions(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> Functions:
+    """The functions of a problem over parts of cells.
 
     Args:
       problem: a problem of one player with costs.
+      x: the state.
+      radii: the largest distance from the centre along every axis.
+    """
+    (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
+    options: list[tuple[qu.Polynomial, list[qu.Polynomial]]] = []
+    if isinstance(problem.controls, Finite):
+        for u in np.asarray(problem.controls.points, float):
+            action = [tf.constant(each) for each in u]
+            drift = tf.taylor_forms(problem.drift, x, action)
+            paid = qu.Polynomial({(): _running_cost(problem, x, action)})
+            options.append((paid, [qu.Polynomial({(): each}) for each in drift]))
+        return Functions(problem, x, radii, rate, options)
+    count = 0 if problem.controls is None else problem.controls.dim
+    with contextlib.suppress(qu.NotQuadraticError):
+        cost = qu.Polynomial({(): tf.constant(0.0)})
+        if problem.cost is not None:
+            cost = qu.quadratics(problem.cost, x, count)[0]
+        options.append((cost, qu.quadratics(problem.drift, x, count)))
+    return Functions(problem, x, radii, rate, options)
+
+
+def cell_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
+    """The defect of a candidate.
+
+    Args:
       cell: the candidate.
       stopped: sets of coordinates whose motion a wall may stop.
     """
-    (rate,) = tf.taylor_forms(problem.discount, *([cell.x] * callable(problem.discount))).reshape(-1)
-    if isinstance(problem.controls, Finite):
-        return _enumerated(problem, cell, rate, stopped)
-    count = 0 if problem.controls is None else problem.controls.dim
-    try:
-        drift = qu.quadratics(problem.drift, cell.x, count)
-        cost = qu.Polynomial({(): tf.constant(0.0)})
-        if problem.cost is not None:
-            cost = qu.quadratics(problem.cost, cell.x, count)[0]
-        return _by_formula(problem, cell, rate, stopped, drift, cost)
-    except qu.NotQuadraticError:
-        return _by_pieces(problem, cell, rate, stopped)
+    if isinstance(cell.functions.problem.controls, Finite):
+        return _enumerated(cell, stopped)
+    with contextlib.suppress(qu.NotQuadraticError):
+        for cost, drift in cell.functions.options:
+            return _by_formula(cell, stopped, cost, drift)
+    return _by_pieces(cell, stopped)
 
 
 def _by_formula(
-    problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]], drift: list[qu.Polynomial],
-    cost: qu.Polynomial,
-) -> CellDefect:  # fmt: skip
+    cell: Cell, stopped: Sequence[frozenset[int]], cost: qu.Polynomial, drift: list[qu.Polynomial]
+) -> CellDefect:
     """By the minimum of a quadratic polynomial of the control."""
+    known = cell.functions
 
     def defect(without: frozenset[int]) -> tuple[Interval, Actions, list[np.ndarray]]:
         total = cost
         for i, (component, slope) in enumerate(zip(drift, cell.p, strict=True)):
             if i not in without:
                 total = total + component * qu.Polynomial({(): slope})
-        least, actions, near = least_over(problem.controls, total)
-        return (rate * cell.w - least).bounds(cell.radii), actions, near
+        least, actions, near = least_over(known.problem.controls, total)
+        return (known.rate * cell.w - least).bounds(known.radii), actions, near
 
     found, actions, near = defect(frozenset())
+    speeds = [range_over(component, actions) for component in drift] if stopped else []
     return CellDefect(
-        found, rate.range, {each: defect(each)[0].hi for each in stopped},
-        [range_over(component, actions) for component in drift], _stacked(near, cell),
-    )  # fmt: skip
+        found, known.rate.range, {each: defect(each)[0].hi for each in stopped}, speeds, _stacked(near, cell)
+    )
 
 
 def _stacked(inputs: Sequence[np.ndarray], cell: Cell) -> np.ndarray:
@@ -270,25 +308,21 @@ def _lower_bound(slope: np.ndarray, curvature: np.ndarray, lo: float, hi: float)
     return np.where(at_end & np.isfinite(least_end), least_end, np.where(curvature > 0, free, -np.inf))
 
 
-def _enumerated(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]]) -> CellDefect:
+def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
     """By enumeration of a finite set."""
+    known = cell.functions
     costs: dict[frozenset[int], list[Form]] = {each: [] for each in (frozenset[int](), *stopped)}
-    speeds: list[list[Interval]] = []
-    for u in np.asarray(problem.controls.points, float):
-        action = [tf.constant(each) for each in u]
-        drift = list(tf.taylor_forms(problem.drift, cell.x, action))
-        paid = _running_cost(problem, cell.x, action)
+    for paid, drift in known.options:
         for without, found in costs.items():
-            found.append(_hamiltonian(paid, drift, cell.p, without))
-        speeds.append([each.range for each in drift])
-    whole = rate * cell.w
-    points, gains = np.asarray(problem.controls.points, float), [each.centre.lo for each in costs[frozenset()]]
+            found.append(_hamiltonian(paid[()], [each[()] for each in drift], cell.p, without))
+    whole = known.rate * cell.w
+    points, gains = np.asarray(known.problem.controls.points, float), [each.centre.lo for each in costs[frozenset()]]
     best = np.argmin(np.stack(np.broadcast_arrays(*gains)), axis=0)
-    bounds = {without: (whole - tf.minimum(*found)).bounds(cell.radii) for without, found in costs.items()}
+    bounds = {without: (whole - tf.minimum(*found)).bounds(known.radii) for without, found in costs.items()}
+    speeds = [iv.union(*(drift[k][()].range for _, drift in known.options)) for k in range(len(cell.p))]
     return CellDefect(
-        bounds[frozenset()], rate.range, {each: bounds[each].hi for each in stopped},
-        [iv.union(*each) for each in zip(*speeds, strict=True)], points[best],
-    )  # fmt: skip
+        bounds[frozenset()], known.rate.range, {each: bounds[each].hi for each in stopped}, speeds, points[best]
+    )
 
 
 def _running_cost(problem: Problem, x: list[Form], u: list[Form]) -> Form:
@@ -303,33 +337,34 @@ def _hamiltonian(paid: Form, drift: Sequence[Form], p: Sequence[Form], without: 
     return paid
 
 
-def _by_pieces(problem: Problem, cell: Cell, rate: Form, stopped: Sequence[frozenset[int]]) -> CellDefect:
+def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
     """By cutting the set into pieces: the control is one more coordinate of each box."""
-    n, whole = len(cell.x), rate * cell.w
+    known = cell.functions
+    problem, n, whole = known.problem, len(known.x), known.rate * cell.w
     high = {each: np.asarray(-np.inf) for each in (frozenset[int](), *stopped)}
     low = np.asarray(-np.inf)
     policy = np.zeros((*np.shape(cell.w.range.lo), problem.controls.dim))
     speeds: list[list[Interval]] = []
     for box, centre, inside in pieces(problem.controls):
         radii = [
-            *cell.radii,
+            *known.radii,
             *(np.nextafter((each.hi - each.lo) / 2 + iv.EPS * abs(each).hi, np.inf) for each in box),
         ]
         action = tf.coordinates(box, [point(c) for c in centre], n + len(box), n)
-        drift = list(tf.taylor_forms(problem.drift, cell.x, action))
-        paid = _running_cost(problem, cell.x, action)
+        drift = list(tf.taylor_forms(problem.drift, known.x, action))
+        paid = _running_cost(problem, known.x, action)
         for without in high:
             gain = whole - _hamiltonian(paid, drift, cell.p, without)
             high[without] = np.maximum(high[without], gain.bounds(radii).hi)
             if not without and inside:  # the derivatives over the piece contain those at its centre
                 at_centre = dataclasses.replace(gain, range=iv.entire(gain.range))
-                still = [*cell.radii, *(np.zeros(()) for _ in box)]
+                still = [*known.radii, *(np.zeros(()) for _ in box)]
                 found = at_centre.bounds(still).lo
                 policy = np.where((found > low)[..., None], centre, policy)
                 low = np.maximum(low, found)
         speeds.append([each.range for each in drift])
     return CellDefect(
-        Interval(low, high[frozenset()]), rate.range, {each: high[each] for each in stopped},
+        Interval(low, high[frozenset()]), known.rate.range, {each: high[each] for each in stopped},
         [iv.union(*each) for each in zip(*speeds, strict=True)], policy,
     )  # fmt: skip
 

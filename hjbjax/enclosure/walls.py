@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hjbjax.enclosure.defect import all_cells
 from hjbjax.enclosure.interpolant import Spline
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -22,13 +23,13 @@ ROUNDING = 1e-12  # relative, larger than the rounding of all sums below
 
 
 @quietly
-def remaining(problem: Problem, grid: Grid, candidate: Spline) -> np.ndarray:
+def remaining(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
     """The largest discount factor at the time when a path from each node meets a projected end, shape (*grid).
 
     Args:
       problem: a problem of one player with costs.
       grid: the grid.
-      candidate: any spline on the grid; only its cells are used.
+      spline: the cells.
 
     Returns:
       e^{−βT}, rounded upward, with the least discount β in the box; zero without projected ends.
@@ -36,15 +37,15 @@ def remaining(problem: Problem, grid: Grid, candidate: Spline) -> np.ndarray:
     ends = grid.sides("projected")
     if not ends:
         return np.zeros(grid.shape)
-    every = tuple(each.ravel() for each in np.meshgrid(*map(np.arange, candidate.shape), indexing="ij"))
-    boxes, centres, _ = candidate.cells(every).boxes(None)
-    x = tf.coordinates(boxes, centres, grid.ndim)
+    every = all_cells(spline)
+    cells = spline.cells(every)
+    x = tf.coordinates(cells.ranges, cells.centres, grid.ndim)
     drift = tf.taylor_forms(problem.drift, x, _any_action(problem.controls))
     (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
     soonest = np.full(grid.shape, np.inf)
     for axis, step in ends:
         outward = drift[axis].range.hi if step > 0 else -drift[axis].range.lo
-        speeds = np.broadcast_to(outward, every[0].shape).reshape(candidate.shape)
+        speeds = np.broadcast_to(outward, every[0].shape).reshape(spline.shape)
         layers = np.max(np.maximum(speeds, 0), axis=tuple(k for k in range(grid.ndim) if k != axis))
         gaps = np.diff(np.asarray(grid.axis(axis), float)) * (1 - ROUNDING)
         crossing = gaps / np.maximum(layers[1:], layers[:-1])

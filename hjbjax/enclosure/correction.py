@@ -22,6 +22,7 @@ from hjbjax.problem.pytree import altered
 
 REACH = 2  # cells by which a source is widened, and then smoothed, so that its E is smooth on the grid
 
+SHARE = 40  # the same on fine grids, as a fraction of an axis: otherwise E falls too steeply across the paths
 MARGIN = 1.3  # a source is larger than the defect, because the chain spreads it
 DIRECT = 2  # states up to which the linear equations are factored
 
@@ -69,6 +70,6 @@ def smooth_cover(excess: np.ndarray, grid: Grid) -> np.ndarray:
     from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
     for axis, cyclic in enumerate(grid.periodic):
-        mode, size = "wrap" if cyclic else "nearest", 2 * REACH + 1
+        mode, size = "wrap" if cyclic else "nearest", 2 * max(REACH, excess.shape[axis] // SHARE) + 1
         excess = uniform_filter1d(maximum_filter1d(excess, size, axis, mode=mode), size, axis, mode=mode)
     return MARGIN * excess

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, Numbers, State
 
 __all__ = ["ball", "box", "ellipsoid", "half_space", "largest", "smooth"]
@@ -148,7 +149,38 @@ class Smooth(_WithoutBarrier):
         return jax.hessian(lambda y: jnp.asarray(self.function(y), theta.dtype))(theta)
 
 
-ConvexFunction: TypeAlias = Largest | Quadratic | Smooth
+@pytree_dataclass(static=("dim",))
+class Conjugated(_WithoutBarrier):
+    """A convex function with its Legendre transform, both from the user; made by ``smooth``. Its dual point is p.
+
+    Args:
+      dim: the number of states n.
+      function: J.
+      transform: J*.
+    """
+
+    dim: int
+    function: Any
+    transform: Any
+
+    def __call__(self, x: State) -> Array:
+        """J(x) at one state."""
+        return self.function(x)
+
+    def start(self, x: State) -> tuple[Array, Array]:
+        """A subgradient at the state, and no constraint."""
+        return jax.grad(lambda y: jnp.asarray(self.function(y), x.dtype))(x), jnp.zeros_like(x)
+
+    def dual(self, theta: Array, mu: Number) -> tuple[Array, Array, Array]:
+        """p, −J*(p) and zero."""
+        return theta, -jnp.asarray(self.transform(theta), theta.dtype), jnp.zeros((), theta.dtype)
+
+    def curvature(self, theta: Array, mu: Number) -> jax.Array:
+        """The second derivative of J*."""
+        return jax.hessian(lambda p: jnp.asarray(self.transform(p), theta.dtype))(theta)
+
+
+ConvexFunction: TypeAlias = Largest | Quadratic | Smooth | Conjugated
 
 
 def ball(center: Numbers | Sequence, radius: Number) -> Largest:
@@ -246,16 +278,42 @@ def largest(functions: Sequence[Largest]) -> Largest:
     )
 
 
-def smooth(function: Callable, states: int) -> Smooth:
-    """Declare that a differentiable function is convex.
+def smooth(function: Callable, states: int, *, conjugate: Callable | None = None) -> Smooth | Conjugated:
+    """Declare that a function is convex, and differentiable unless its Legendre transform is given.
 
-    The bounds of ``hopf`` are wrong if it is not.
+    The bounds of ``hopf`` are wrong if the declaration is.
 
     Args:
       function: J, a function of one state.
       states: the number of states n.
+
+    Keyword Args:
+      conjugate: the Legendre transform J*(p) = max_x [p·x − J(x)], which must be differentiable and finite for all p.
+        Then J may have kinks, such as |x|² + |x₁|.
+
+    Raises:
+      ValueError: at a random state x, J(x) + J*(p) differs from p·x with the gradient p of J.
     """
-    return Smooth(int(states), as_partial(function, "convex.smooth: function"))
+    own = as_partial(function, "convex.smooth: function")
+    if conjugate is None:
+        return Smooth(int(states), own)
+    found = Conjugated(int(states), own, as_partial(conjugate, "convex.smooth: conjugate"))
+    if not is_traced(found):
+        _check_transform(found)
+    return found
+
+
+def _check_transform(found: Conjugated) -> None:
+    """Refuse a Legendre transform that does not meet Fenchel's equality at some random states."""
+    for x in np.random.default_rng(0).normal(size=(4, found.dim)):
+        with own_settings(x64=True):
+            p = found.start(jnp.asarray(x))[0]
+            at_state, at_costate, product = float(found(jnp.asarray(x))), float(found.transform(p)), float(p @ x)
+        if not abs(at_state + at_costate - product) <= 1e-6 * (abs(at_state) + abs(at_costate) + abs(product)):
+            raise ValueError(
+                f"convex.smooth: at x = {x.tolist()} with the gradient p of J, J(x) + J*(p) is\n"
+                f"{at_state + at_costate:.6g}, wanted p·x = {product:.6g}: this is not the Legendre transform of J"
+            )
 
 
 def _vector(value: Numbers | Sequence, name: str) -> Any:

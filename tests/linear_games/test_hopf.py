@@ -180,6 +180,26 @@ def test_a_convex_quadratic_is_recognised_and_its_concave_twin_exchanges_the_pla
         )  # fmt: skip
 
 
+def bent(x):
+    return x @ x / 2 + jnp.sum(jnp.abs(x))
+
+
+@pytest.mark.slow
+def test_a_legendre_transform_allows_kinks():
+    """x' = u, |u_i| ≤ 1: the distance to 0 shrinks by the time to go on each axis."""
+    terminal = hjb.convex.smooth(bent, 3, conjugate=lambda p: jnp.sum(jnp.maximum(jnp.abs(p) - 1, 0) ** 2) / 2)
+    solution = hjb.hopf(free_motion(hjb.Box([-1.0] * 3, [1.0] * 3), terminal), 1.0, intervals=4)
+    x = np.random.default_rng(0).uniform(-3, 3, (12, 3))
+    left = np.maximum(np.abs(x) - 1, 0)
+    assert np.abs(solution.value_at(0.0, x) - np.sum(left**2 / 2 + left, axis=1)).max() < 1e-7
+    assert solution.error_at(0.0, x).max() < 1e-6
+
+
+def test_a_function_that_is_not_the_legendre_transform_is_refused():
+    with pytest.raises(ValueError, match="not the Legendre transform"):
+        hjb.convex.smooth(bent, 3, conjugate=lambda p: p @ p / 2)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

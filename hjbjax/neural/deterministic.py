@@ -45,7 +45,7 @@ ROUNDS = 4  # in which the extremals are computed, half of them before the train
 WARM = 0.25  # of the steps, over which the weight of the residual grows from zero to one
 POINTS = 128  # of extremals in a batch
 ENOUGH = 1e-8  # relative residual of a value that needs no training, such as the linear-quadratic one
-ROUGH = 1e-6  # tolerance of the extremals
+BIAS = 0.5  # of a network that has to learn the quadratic part
 
 
 @pytree_dataclass(static=("rule",))
@@ -125,8 +125,8 @@ def solve(
       seed: of the weights and of all random states; the same seed gives the same result on the same machine.
       horizon: T, in units of time; the value then depends on (t, x) and is the terminal cost at T. ``None``: infinite.
       rest: a state near the rest point of an infinite horizon. ``None``: the origin.
-      quadratic: False leaves the linear-quadratic solution out of the value, for comparison. The training may then end
-        at another solution of the equation, such as a negative one.
+      quadratic: False leaves the linear-quadratic solution out of the value, for comparison. With few extremals the
+        training may then end at another solution of the equation, such as a negative one.
       extremals: number of extremals for the training; 0 trains on the residual of the equation only.
       held_out: number of further extremals for the validation.
       steps: steps of the optimiser.
@@ -163,7 +163,8 @@ def solve(
         equation = Equation(settled, jnp.asarray(corners[0]), jnp.asarray(corners[1]), 0.0, 0.0, rule)
         if horizon is None:
             ansatz: Any
-            equation, ansatz = _at_rest(equation, rest, quadratic, initial_weights(seed, n, widths))
+            bias = 0.0 if quadratic else BIAS
+            equation, ansatz = _at_rest(equation, rest, quadratic, initial_weights(seed, n, widths, bias=bias))
             options: dict[str, Any] = {"rest": ansatz.state}
         else:
             duration = float(arguments.positive(horizon, f"{NAME}: horizon", "in units of time"))
@@ -235,8 +236,11 @@ def _trained(
     """The training on the residual and on extremals, some of which are added on the way."""
     steps, batch = counts
     size = (equation.hi - equation.lo) / 2
+    pure = isinstance(ansatz, RestAnsatz) and not ansatz.quadratic
     values = jax.vmap(lambda t, x: ansatz(equation.problem, t, x))(*equation.places(jax.random.key(0), HELD_OUT))
-    least = jnp.maximum(FLOOR * jnp.mean(jnp.abs(values)), jnp.finfo(float).tiny)
+    # without its quadratic part the initial value may be zero everywhere; the mean of |y|² is as large as the exact one
+    typical = jnp.sum(jnp.diagonal(ansatz.norm) * ansatz.size**2) / 3 if pure else jnp.mean(jnp.abs(values))
+    least = jnp.maximum(FLOOR * typical, jnp.finfo(float).tiny)
 
     def of(weights: Any) -> Any:
         return dataclasses.replace(ansatz, weights=weights)
@@ -263,11 +267,15 @@ def _trained(
     chunks = -(-steps // CHUNK)
     rounds = {chunks * k // ROUNDS: -(-seen.capacity // (2 * (ROUNDS - 1))) for k in range(1, ROUNDS)}
     rounds[0] = seen.capacity // 2 + seen.capacity % 2
+    if pure:  # the Riccati equation alone has up to 2ⁿ solutions: compute all extremals before the residual counts
+        rounds = {0: seen.capacity}
 
     def refresh(weights: Any, number: int, data: Any) -> Any:
         if (share := rounds.get(number, 0)) and len(seen.starts) < seen.capacity:
             places = equation.places(jax.random.key(seed + 2 + number), CANDIDATES * share)
-            worst = np.argmax(np.asarray(residuals(weights, places)).reshape(share, CANDIDATES), axis=1)
+            # at the start of a pure network the residual only measures the distance to the rest point
+            large = np.zeros((share, CANDIDATES)) if pure else np.asarray(residuals(weights, places))
+            worst = np.argmax(large.reshape(share, CANDIDATES), axis=1)
             starts = np.asarray(places[1]).reshape(share, CANDIDATES, -1)[np.arange(share), worst]
             seen.collect(equation.problem, starts, clock)
             data = seen.arrays()

@@ -18,14 +18,19 @@ from hjbjax.problem.types import Array
 Weights: TypeAlias = tuple[tuple[Any, Any], ...]
 
 
-def initial_weights(seed: int, inputs: int, layers: Sequence[int]) -> Weights:
-    """Random weights with variance 1/fan-in (LeCun), zero biases, and a last layer of zeros."""
+def initial_weights(seed: int, inputs: int, layers: Sequence[int], *, bias: float = 0.0) -> Weights:
+    """Random weights with variance 1/fan-in (LeCun), biases of size ``bias``, and a last layer of zeros.
+
+    Without biases the hidden layers are odd functions, and the network first has to learn to be even.
+    """
     draw = np.random.default_rng(seed)
     sizes = [inputs, *layers]
     hidden = [
         (draw.normal(size=(before, after)) / np.sqrt(before), np.zeros(after))
         for before, after in itertools.pairwise(sizes)
     ]
+    if bias:
+        hidden = [(matrix, bias * draw.normal(size=zeros.shape)) for matrix, zeros in hidden]
     return (*hidden, (np.zeros((sizes[-1], 1)), np.zeros(1)))
 
 

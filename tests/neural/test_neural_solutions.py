@@ -187,17 +187,21 @@ def relative(error, exact):
 
 @pytest.mark.slow
 @pytest.mark.optimised
-def test_ten_states_by_the_linear_quadratic_part():
+@pytest.mark.parametrize(
+    ("options", "error"), [({"held_out": 1}, 1e-6), ({"held_out": 4, "quadratic": False, "layers": (128,)}, 0.01)]
+)
+def test_a_linear_quadratic_value_in_ten_states(options, error):
+    """By the ansatz, and by the network without its quadratic part."""
     draw = np.random.default_rng(0)
     a, b = draw.normal(size=(10, 10)) / 4 - 0.5 * np.eye(10), draw.normal(size=(10, 3))
     problem = hjb.Problem(
         lambda x, u: jnp.asarray(a) @ x + jnp.asarray(b) @ u, lambda x, u: x @ x + u @ u,
         hjb.Box([-500.0] * 3, [500.0] * 3),
     )  # fmt: skip
-    found = neural.solve(problem, [-1.0] * 10, [1.0] * 10, seed=0, held_out=1)
+    found = neural.solve(problem, [-1.0] * 10, [1.0] * 10, seed=0, **options)
     states = draw.uniform(-1, 1, (1000, 10))
     exact = np.einsum("ki,ij,kj->k", states, solve_continuous_are(a, b, np.eye(10), np.eye(3)), states)
-    assert relative(found.value_at(states) - exact, exact) < 1e-6
+    assert relative(found.value_at(states) - exact, exact) < error
 
 
 @pytest.mark.slow

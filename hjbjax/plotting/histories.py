@@ -98,7 +98,7 @@ def controls(
     names = tuple(names or (words.control(i, count) for i in range(count)))
     ax = axes_of(ax, wide=True)
     # a step continues through the last interval; a line stops before it, because the control at the end is unknown
-    held = path.held or len(inputs) == 1
+    held = getattr(path, "held", True) or len(inputs) == 1  # extremals and users' own paths do not say
     drawing = "steps-post" if held else "default"
     # a path that ends at once has no controls
     shown = np.concatenate([inputs, inputs[-1:] if held else np.full((1, count), np.nan)])

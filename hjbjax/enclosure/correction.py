@@ -21,8 +21,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 
 REACH = 2  # cells by which a source is widened, and then smoothed, so that its E is smooth on the grid
-
-SHARE = 40  # the same on fine grids, as a fraction of an axis: otherwise E falls too steeply across the paths
+SHARE = 40  # the cells of an axis over its reach on fine grids: otherwise E falls too steeply across the paths
 MARGIN = 1.3  # a source is larger than the defect, because the chain spreads it
 DIRECT = 2  # states up to which the linear equations are factored
 

@@ -272,7 +272,7 @@ class _Task:
         for _ in range(rounds):
             lead = self.lead(values, kept, sign)
             found = self.bisected(values, found, lead, sign)
-            sizes = np.minimum(found.high if sign > 0 else -found.low, lead)
+            sizes = _sizes(found, lead, sign)
             shift = float(np.max(sizes))
             if not np.isfinite(shift):
                 break
@@ -310,7 +310,7 @@ class _Task:
         for move in (lambda: self.move(found, correction.smooth_cover(excess, self.grid)), lambda: excess):
             option = values - sign * move()
             after = self.defects(option)
-            sizes = np.minimum(after.high if sign > 0 else -after.low, self.lead(option, kept, sign))
+            sizes = _sizes(after, self.lead(option, kept, sign), sign)
             shift = float(np.max(sizes))
             options.append((float(np.mean(sign * option)) - shift, option, after))
             if shift < HELPS * kept[-1][1]:
@@ -321,7 +321,7 @@ class _Task:
     def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
         """The defects with the cells that determine the shift cut into parts, at most one in ten."""
         for depth in range(1, BISECTIONS + 1):
-            sizes = np.minimum(found.high if sign > 0 else -found.low, lead)
+            sizes = _sizes(found, lead, sign)
             if not np.all(np.isfinite(sizes)):
                 break
             level = max(LARGEST * np.max(sizes), np.quantile(sizes, 0.9))
@@ -374,18 +374,25 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
     return known, value, grid
 
 
+def _sizes(found: Defects, lead: np.ndarray, sign: int) -> np.ndarray:
+    """The shift that every cell requires, (*cells): its defect, or the lead if that is smaller."""
+    return np.minimum(found.high if sign > 0 else -found.low, lead)
+
+
 def _peak_bytes(problem: Problem, grid: Grid) -> int:
-    """Bytes that ``enclose`` uses at its peak: all scalars of one block of cells, and per node the weights of the
-    spline, the functions of the problem and the factors of the chain."""
+    """Bytes that ``enclose`` uses at its peak: all scalars of one block of cells, and arrays at all nodes.
+
+    These are the weights of the spline, the functions of the problem and the factors of the chain.
+    """
     n, m = grid.ndim, 0 if problem.controls is None else problem.controls.dim
     arguments = ([0.0] * n, [0.0] * m)
     counts = [operations(traced(each, *arguments)) for each in (problem.drift, problem.cost) if each is not None]
     scalars = 60 + sum(each.single + each.whole for each in counts)
     # range, centre, slopes, gradient and second derivatives, each with two bounds
-    each = 8 * 2 * (2 + 2 * n + n * (n + 1) // 2)
-    block = each * min(grid.size, defect.BLOCK) * scalars
+    scalar = 8 * 2 * (2 + 2 * n + n * (n + 1) // 2)
+    block = scalar * min(grid.size, defect.BLOCK) * scalars
     terms = len(problem.controls.points) if isinstance(problem.controls, Finite) else m + 1
-    known = each * (2 + (n + 1) * terms) + 8 * 27 * n
+    known = scalar * (2 + (n + 1) * terms) + 8 * 27 * n
     fill = 31 * np.log2(grid.size + 2) if n <= correction.DIRECT else 20
     return int(block + grid.size * (12 * fill + 8 * 30 + known))
 

@@ -30,7 +30,7 @@ from hjbjax.hamiltonian.pointwise import Rule
 from hjbjax.neural import ingredients
 from hjbjax.neural.ansatz import HorizonAnsatz, terminal_cost
 from hjbjax.neural.network import checked_layers, initial_weights
-from hjbjax.neural.solution import NeuralSolution, begun_weights
+from hjbjax.neural.solution import NeuralSolution, weights_of_guess
 from hjbjax.neural.training import Training, train
 from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
@@ -151,7 +151,7 @@ def deep_bsde(
         plant = Plant(settled, jnp.asarray(start), horizon, rule)
         ansatz = _first_ansatz(plant, counts[0], seed, widths)
         if guess is not None:
-            begun_weights(guess, len(start) + 2, widths, NAME)
+            weights_of_guess(guess, len(start) + 2, widths, NAME)
             ansatz = dataclasses.replace(guess.ansatz, horizon=horizon)
         found = _trained(plant, ansatz, counts, batch, rate, seed, clock)
         if found.status in CUT and not found.history:

@@ -26,7 +26,7 @@ from hjbjax.neural import ingredients
 from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz, norm_of, terminal_cost
 from hjbjax.neural.extremal_samples import ExtremalSamples
 from hjbjax.neural.network import checked_layers, initial_weights
-from hjbjax.neural.solution import NeuralSolution, begun_weights, value_of
+from hjbjax.neural.solution import NeuralSolution, value_of, weights_of_guess
 from hjbjax.neural.training import CHUNK, Training, train
 from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
@@ -171,7 +171,7 @@ def solve(
             equation, ansatz = _over_horizon(equation, duration, initial_weights(seed, n + 2, widths))
             options = {"horizon": duration}
         if guess is not None:
-            begun = begun_weights(guess, np.shape(ansatz.weights[0][0])[0], widths, NAME)
+            begun = weights_of_guess(guess, np.shape(ansatz.weights[0][0])[0], widths, NAME)
             ansatz = dataclasses.replace(ansatz, weights=begun)
         seen, unseen = (ExtremalSamples(*corners, count, options) for count in (extremals, held_out))
         unseen.collect(settled, draw.uniform(*corners, (2 * held_out, n)), clock)

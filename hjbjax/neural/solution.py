@@ -214,7 +214,7 @@ class NeuralSolution(files.Saved):
         return "\n".join([*lines, f"  {'seconds':<16} {self.seconds:.3g}"])
 
 
-def begun_weights(guess: object, inputs: int, layers: Sequence[int], name: str) -> Any:
+def weights_of_guess(guess: object, inputs: int, layers: Sequence[int], name: str) -> Any:
     """The weights of a guess.
 
     Raises:

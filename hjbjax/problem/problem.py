@@ -173,9 +173,8 @@ class Problem:
     ):
         _check_functions(drift, target)
         _check_sets(controls, disturbances)
-        count = (
-            None if callable(controls) else 0 if controls is None else controls.dim
-        )  # unknown for a function of the state
+        # unknown for a function of the state
+        count = None if callable(controls) else 0 if controls is None else controls.dim
         words = labelling.checked(control_names, control_units, inside, count)
         # static: the order of min and max is part of a compiled program
         if isaacs not in ("upper", "lower"):

@@ -12,6 +12,7 @@ import jupytext
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from matplotlib import colormaps
 from PIL import Image
@@ -78,6 +79,27 @@ def test_a_subscript_stands_next_to_an_accented_letter():
     shown = re.sub(r"\s", "", mathml.converted(r"\dot x_1 = \sum_i^n x"))
     assert '<msub><moveraccent="true"><mi>x</mi><mostretchy="false">˙</mo></mover><mn>1</mn></msub>' in shown
     assert "<munderover>" in shown  # the limits of a sum stay where they are
+
+
+def equations(page):
+    """The equations of a page in Markdown, without those in code."""
+    text = re.sub(r"^(```+|~~~+).*?^\1|`[^`\n]+`", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    around, blocks = text.split("$$")[::2], text.split("$$")[1::2]
+    return blocks + [piece for prose in around for piece in prose.split("$")[1::2]]
+
+
+def test_every_equation_of_the_pages_can_be_drawn():
+    """docutils knows a part of LaTeX, and a command outside it ends the build."""
+    pages = sorted(DOCS.rglob("*.md"))
+    found = [(page.name, tex) for page in pages for tex in equations(page)]
+    assert len(found) > 200
+    unknown = []
+    for page, tex in found:
+        try:
+            mathml.converted(tex)
+        except MathError as error:
+            unknown.append((page, tex, str(error)))
+    assert not unknown
 
 
 def test_no_page_of_a_notebook_shows_the_text_of_an_object():

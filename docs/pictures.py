@@ -17,7 +17,7 @@ COLOURS = 256  # size of the palette; a picture has a quarter of the bytes of fu
 ALIKE = 16  # this number of adjacent shades of red, green or blue count as one colour
 EXACT = 16  # the most frequent colours, which are not averaged: paper, panes, frames and lines
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-PAGES = ("README.md", "docs/getting_started.md")
+PAGES = ("README.md", "docs/getting_started.md", "docs/enclose.md")
 
 
 def draw(docs: Path, names: Sequence[str] = ()) -> None:

@@ -18,7 +18,8 @@ from hjbjax.calibration.trajectories import fit_trajectories
 from hjbjax.decomposition.combination import BlockSolution
 from hjbjax.decomposition.decompose import Decomposition, decompose
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
-from hjbjax.enclosure.enclose import Enclosure, enclose
+from hjbjax.enclosure.bounds import Enclosure
+from hjbjax.enclosure.enclose import enclose
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
 from hjbjax.feedback.feedback import greedy_feedback

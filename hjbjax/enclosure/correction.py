@@ -12,6 +12,7 @@ Nothing here needs to be exact: the defects of the corrected candidate are bound
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -26,11 +27,11 @@ MARGIN = 1.3  # a source is larger than the defect, because the chain spreads it
 DIRECT = 2  # states up to which the linear equations are factored
 
 
-def on_nodes(cells: np.ndarray, grid: Grid) -> np.ndarray:
-    """Numbers per cell as numbers per node; a periodic axis has one more cell than nodes."""
+def on_nodes(cells: np.ndarray, grid: Grid, join: Callable[..., Any] = np.mean) -> np.ndarray:
+    """Numbers per cell as numbers per node; a periodic axis has one more cell than nodes, and ``join`` combines two."""
     for axis, cyclic in enumerate(grid.periodic):
         if cyclic:
-            ends = np.take(cells, [0, -1], axis=axis).mean(axis=axis, keepdims=True)
+            ends = join(np.take(cells, [0, -1], axis=axis), axis=axis, keepdims=True)
             middle = np.delete(cells, [0, cells.shape[axis] - 1], axis=axis)
             cells = np.concatenate([ends, middle], axis=axis)
     return cells

@@ -9,8 +9,9 @@ import jax
 import numpy as np
 
 from hjbjax.enclosure import correction, defect, walls
+from hjbjax.enclosure.bounds import Bound, Enclosure
 from hjbjax.enclosure.defect import CellBlock, Defects
-from hjbjax.enclosure.interpolant import Spline, axis_table
+from hjbjax.enclosure.interpolant import Spline
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import REWARD
@@ -20,7 +21,6 @@ from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import in_unit_box
-from hjbjax.problem.types import Numbers
 from hjbjax.solution.rewards import in_costs
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
@@ -45,10 +45,11 @@ def enclose(
     problem: Problem,
     solution: Solution,
     *,
+    region: Sequence | np.ndarray | None = None,
     tol: float = 1e-3,
     rounds: int = 8,
     max_memory: int | None = None,
-) -> "Enclosure":
+) -> Enclosure:
     """Bounds on the value of the continuous problem, with proof: neither the grid nor rounding is neglected.
 
     A spline W near the solution has the defect β W − H(x, DW). If it is at most β k everywhere, V ≥ W − k; if it is at
@@ -64,7 +65,9 @@ def enclose(
         one.
 
     Keyword Args:
-      tol: the wanted mean width, relative to the range of V.
+      region: where narrow bounds are wanted: a pair (lower corner, upper corner), or a mask of the nodes, bool (*grid).
+        Corrections are chosen for this region and end once the bounds are narrow there. The bounds hold everywhere.
+      tol: the wanted mean width in the region, relative to the range of V there.
       rounds: the largest number of corrections per bound.
       max_memory: the number of bytes that count as free.
 
@@ -88,122 +91,27 @@ def enclose(
     arguments.positive(tol, "enclose: tol")
     count = arguments.count(rounds, "enclose: rounds")
     needed = memory.fitting(_peak_bytes(own, grid), grid, max_memory)
-    scale = float(np.ptp(value)) or 1.0
+    chosen = _chosen(region, grid)
+    scale = float(np.ptp(value[chosen])) or 1.0
     with own_settings(x64=True):
-        spline = Spline(tuple(axis_table(grid, axis) for axis in range(grid.ndim)))
+        spline = Spline.on(grid)
         known = defect.blocks(own, grid, spline, defect.all_cells(spline), 0)
-        task = _Task(own, grid, spline, known, scale * tol)
+        task = _Task(own, grid, spline, known, scale * tol, chosen)
         middle, found = task.corrected(value)
-        lower = task.bound(middle, found, 1, count)
-        upper = task.bound(middle, found, -1, count)
+        bounds = [task.bound(middle, found, sign, count) for sign in (1, -1)]
         remaining = walls.remaining(own, grid, spline)
     if problem.payoff == REWARD:
-        lower, upper = upper.negative(), lower.negative()
+        bounds = [(each.negative(), sizes) for each, sizes in reversed(bounds)]
+    (lower, below), (upper, above) = bounds
     nodes = grid.nodes().reshape(-1, grid.ndim)
     low, high = (each.at(nodes).reshape(grid.shape) for each in (lower, upper))
-    share = float(np.mean(high - low)) / scale
+    share = float(np.mean((high - low)[chosen])) / scale
     stats = {"seconds": time.perf_counter() - start, "bytes": needed, "corrections": len(lower.shifts + upper.shifts)}
     status = Status.CONVERGED if share <= tol else Status.MAX_STEPS
     return Enclosure(
-        solution.grid, low, high, status, _message(solution.grid, share, tol), stats, remaining, (lower, upper)
-    )
-
-
-@dataclasses.dataclass(frozen=True)
-class Bound:
-    """One bound: the best of several shifted splines.
-
-    Attributes:
-      spline: the cells of the grid.
-      coefficients: of every spline, each (*grid).
-      shifts: the numbers that are subtracted from a lower bound, or added to an upper bound.
-      sign: 1 for a lower and −1 for an upper bound.
-    """
-
-    spline: Spline
-    coefficients: tuple[np.ndarray, ...]
-    shifts: tuple[float, ...]
-    sign: int
-
-    def at(self, states: np.ndarray) -> np.ndarray:
-        """The bound at states (count, n) inside the box, rounded to its side."""
-        best, places = np.full(len(states), -self.sign * np.inf), self.spline.at(states)
-        for values, shift in zip(self.coefficients, self.shifts, strict=True):
-            found = places.values(values)
-            if self.sign > 0:
-                best = np.maximum(best, (found - point(shift)).lo)
-            else:
-                best = np.minimum(best, (found + point(shift)).hi)
-        return best
-
-    def negative(self) -> "Bound":
-        """Minus the bound, which is a bound from the other side."""
-        return Bound(self.spline, tuple(-each for each in self.coefficients), self.shifts, -self.sign)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Enclosure:
-    """Two functions between which the value of the continuous problem lies; made by ``enclose``.
-
-    Args:
-      grid: the grid.
-      lower: the lower bound at the nodes, shape (*grid), in cost units.
-      upper: the upper bound at the nodes.
-      status: CONVERGED if the mean width is at most ``tol`` times the range of V, otherwise MAX_STEPS. The bounds hold
-        in both cases.
-      message: the problem that the bounds refer to, and their mean width.
-      stats: "seconds", "bytes" (the estimated memory) and "corrections".
-      remaining: e^{−βT} at the nodes, shape (*grid), where T is a lower bound of the time until a path can meet a
-        projected end. If the problem continues beyond the box, its value differs from the value between walls by at
-        most this factor times the largest difference at the ends. Zero without projected ends.
-      bounds: the lower and the upper bound as functions.
-    """
-
-    grid: Grid
-    lower: np.ndarray
-    upper: np.ndarray
-    status: Status
-    message: str
-    stats: dict
-    remaining: np.ndarray
-    bounds: tuple[Bound, Bound] = dataclasses.field(repr=False)
-
-    @property
-    def width(self) -> np.ndarray:
-        """The upper minus the lower bound at the nodes, shape (*grid)."""
-        return self.upper - self.lower
-
-    def lower_at(self, x: Numbers | Sequence) -> Any:
-        """The lower bound between the nodes.
-
-        Args:
-          x: states, shape (n,) or (..., n).
-
-        Returns:
-          Shape (...), in cost units; NaN outside the box.
-        """
-        return self._at("lower_at", 0, x)
-
-    def upper_at(self, x: Numbers | Sequence) -> Any:
-        """The upper bound between the nodes; see ``lower_at``."""
-        return self._at("upper_at", 1, x)
-
-    def _at(self, name: str, side: int, x: Numbers | Sequence) -> Any:
-        states, n = np.asarray(x, float), self.grid.ndim
-        if states.ndim == 0 or states.shape[-1] != n:
-            raise ValueError(f"Enclosure.{name}: got states of shape {states.shape}, wanted (..., {n})")
-        flat = states.reshape(-1, n)
-        lo, hi = np.asarray(self.grid.lo, float), np.asarray(self.grid.hi, float)
-        cyclic = np.array(self.grid.periodic)
-        flat = np.where(cyclic & ((flat < lo) | (flat > hi)), lo + np.mod(flat - lo, hi - lo), flat)
-        inside = np.all((flat >= lo) & (flat <= hi), axis=-1)
-        found = np.full(len(flat), np.nan)
-        if np.any(inside):
-            found[inside] = self.bounds[side].at(flat[inside])
-        return found.reshape(states.shape[:-1])
-
-    def __repr__(self) -> str:
-        return f"Enclosure({self.status}, largest width {np.max(self.width):.3g} on {self.grid.size} nodes)"
+        solution.grid, low, high, status, _message(solution.grid, share, tol, region is not None), stats, remaining,
+        np.stack([below, above]), (lower, upper),
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,6 +124,7 @@ class _Task:
       spline: the cells of the grid.
       known: the functions of the problem over all cells.
       wanted: the width at which corrections stop, in cost units.
+      chosen: True at the nodes where narrow bounds are wanted, shape (*grid).
     """
 
     problem: Problem
@@ -223,6 +132,7 @@ class _Task:
     spline: Spline
     known: list[CellBlock]
     wanted: float
+    chosen: np.ndarray
 
     def defects(self, values: np.ndarray) -> Defects:
         """The defects of the spline with these coefficients."""
@@ -261,14 +171,15 @@ class _Task:
             values, found = changed, after
         return values, found
 
-    def bound(self, values: np.ndarray, found: Defects, sign: int, rounds: int) -> Bound:
-        """The best bound after corrections.
+    def bound(self, values: np.ndarray, found: Defects, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
+        """The best bound after corrections, and the shift that the cell around each node requires without them.
 
         Raises:
           ValueError: no bound is finite.
         """
         kept: list[tuple[np.ndarray, float]] = []
         best, stagnant = np.full(self.grid.shape, -np.inf), 0
+        required = np.zeros(self.grid.shape)
         for _ in range(rounds):
             lead = self.lead(values, kept, sign)
             found = self.bisected(values, found, lead, sign)
@@ -276,11 +187,13 @@ class _Task:
             shift = float(np.max(sizes))
             if not np.isfinite(shift):
                 break
-            before = np.mean(best)
+            if not kept:
+                required = correction.on_nodes(sizes, self.grid, np.max)
+            before = np.mean(best[self.chosen])
             best = np.maximum(best, sign * values - shift)
             kept.append((values, shift))
             # progress is measured by the part of the width that one more correction may win
-            gain = np.mean(best) - before
+            gain = np.mean(best[self.chosen]) - before
             stagnant = 0 if gain > (1 - GAIN) * max(shift, self.wanted) else stagnant + 1
             if shift <= self.wanted / 4 or stagnant >= STAGNANT:
                 break
@@ -288,7 +201,8 @@ class _Task:
             values, found = self.better(values, found, excess, kept, sign)
         if not kept:
             raise ValueError(_no_bound(self.grid, found, sign))
-        return Bound(self.spline, tuple(each for each, _ in kept), tuple(shift for _, shift in kept), sign)
+        coefficients, shifts = zip(*kept, strict=True)
+        return Bound(self.spline, coefficients, shifts, sign), required
 
     def lead(self, values: np.ndarray, kept: list[tuple[np.ndarray, float]], sign: int) -> np.ndarray:
         """The shift from which on a candidate is nowhere in a cell better than the bounds so far, shape (*cells)."""
@@ -312,7 +226,7 @@ class _Task:
             after = self.defects(option)
             sizes = _sizes(after, self.lead(option, kept, sign), sign)
             shift = float(np.max(sizes))
-            options.append((float(np.mean(sign * option)) - shift, option, after))
+            options.append((float(np.mean((sign * option)[self.chosen])) - shift, option, after))
             if shift < HELPS * kept[-1][1]:
                 break
         _, option, after = max(options, key=lambda each: each[0])
@@ -374,6 +288,30 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
     return known, value, grid
 
 
+def _chosen(region: Any, grid: Grid) -> np.ndarray:
+    """True at the nodes of a region, shape (*grid).
+
+    Raises:
+      ValueError: the region is neither a box nor a mask of the nodes, or has no nodes.
+    """
+    if region is None:
+        return np.ones(grid.shape, bool)
+    array = np.asarray(region)
+    if array.dtype == bool and array.shape == grid.shape:
+        found = array
+    elif array.dtype != bool and array.shape == (2, grid.ndim):
+        nodes = grid.nodes()
+        found = np.all((nodes >= array[0]) & (nodes <= array[1]), axis=-1)
+    else:
+        raise ValueError(
+            f"enclose: got a region of shape {array.shape} and type {array.dtype}; wanted a pair of corners (lo, hi)\n"
+            f"of {grid.ndim} numbers each, or a mask of the nodes, bool {grid.shape}"
+        )
+    if not np.any(found):
+        raise ValueError("enclose: got a region that contains no node; wanted a larger one")
+    return found
+
+
 def _sizes(found: Defects, lead: np.ndarray, sign: int) -> np.ndarray:
     """The shift that every cell requires, (*cells): its defect, or the lead if that is smaller."""
     return np.minimum(found.high if sign > 0 else -found.low, lead)
@@ -397,12 +335,13 @@ def _peak_bytes(problem: Problem, grid: Grid) -> int:
     return int(block + grid.size * (12 * fill + 8 * 30 + known))
 
 
-def _message(grid: Grid, share: float, tol: float) -> str:
+def _message(grid: Grid, share: float, tol: float, is_part: bool) -> str:
     """The statement that is proved, and its width."""
     with_walls = bool(grid.sides("projected"))
     which = "the problem with walls at the projected ends of the box" if with_walls else "the continuous problem"
     end = "" if share <= tol else f", above tol = {tol:g}: use more nodes, or a better solution"
-    return f"The value of {which} lies between the bounds; their mean width is {share:.2g} of the range of V{end}."
+    width = f"their mean width{' in the region' * is_part} is {share:.2g} of the range of V"
+    return f"The value of {which} lies between the bounds; {width}{end}."
 
 
 def _no_bound(grid: Grid, found: Defects, sign: int) -> str:

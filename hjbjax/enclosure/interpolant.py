@@ -49,6 +49,7 @@ class AxisTable:
     """The spline along one axis.
 
     Attributes:
+      at: the coordinates of the nodes; on a periodic axis also of its upper end.
       periodic: True if the last cell is the first one again.
       between: the ends of the cells inside the box.
       lower: the lower end of every cell.
@@ -57,6 +58,7 @@ class AxisTable:
       weights: of the derivatives of order 0, 1 and 2.
     """
 
+    at: np.ndarray
     periodic: bool
     between: np.ndarray
     lower: Interval
@@ -65,11 +67,14 @@ class AxisTable:
     weights: tuple[AxisWeights, ...]
 
 
-def axis_table(grid: Grid, axis: int) -> AxisTable:
-    """The spline along one axis of a grid."""
-    at, count, cyclic = np.asarray(grid.axis(axis), float), grid.shape[axis], grid.periodic[axis]
-    if cyclic:
-        at = np.append(at, float(grid.hi[axis]))
+def axis_table(at: np.ndarray, cyclic: bool) -> AxisTable:
+    """The spline along one axis.
+
+    Args:
+      at: the coordinates of the nodes; on a periodic axis also of its upper end.
+      cyclic: True for a periodic axis.
+    """
+    count = len(at) - cyclic
     between = (at[:-1] + at[1:]) / 2  # the ends of the cells, exact numbers like the nodes
     below, above = point(at[1:]) - point(between), point(between) - point(at[:-1])
     first = _take(below, [-1]) if cyclic else _take(above, [0])
@@ -90,7 +95,7 @@ def axis_table(grid: Grid, axis: int) -> AxisTable:
     else:
         nodes = np.clip(index, 0, count - 1)
         _extrapolate(weights, nodes, count)
-    return AxisTable(cyclic, between, point(at) - below, lengths, nodes, _derivatives(weights, lengths))
+    return AxisTable(at, cyclic, between, point(at) - below, lengths, nodes, _derivatives(weights, lengths))
 
 
 def _extrapolate(weights: Interval, nodes: np.ndarray, count: int) -> None:
@@ -246,6 +251,15 @@ class Spline:
     """
 
     tables: tuple[AxisTable, ...]
+
+    @classmethod
+    def on(cls, grid: Grid) -> "Spline":
+        """The cells of the nodes of a grid."""
+        axes = [np.asarray(grid.axis(axis), float) for axis in range(grid.ndim)]
+        ends = [[float(end)] if cyclic else [] for end, cyclic in zip(grid.hi, grid.periodic, strict=True)]
+        return cls(tuple(
+            axis_table(np.append(at, end), cyclic) for at, end, cyclic in zip(axes, ends, grid.periodic, strict=True)
+        ))  # fmt: skip
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -11,6 +11,7 @@ periodic axis is closed at its seam. Names and units come from ``Grid(names=, un
 ticks at multiples of π. If a solution carries its problem, its target is outlined.
 """
 
+from hjbjax.plotting.enclosures import enclosure
 from hjbjax.plotting.estimates import density, estimates
 from hjbjax.plotting.histories import controls, costates
 from hjbjax.plotting.level_sets import Scene, animation, turning_surface, zero_level_set
@@ -30,6 +31,7 @@ __all__ = [
     "convergence",
     "costates",
     "density",
+    "enclosure",
     "estimates",
     "level_surface",
     "perturbation",

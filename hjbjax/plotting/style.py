@@ -45,10 +45,11 @@ DRAWN: dict[str, tuple[tuple[str, ...], str]] = {
     "extremal": (("times", "costates"), "the extremal of pontryagin"),
     "grid": (("shape", "periodic"), "a Grid, such as solution.grid"),
     "residuals.solution": (("residuals",), "the Solution of solve"),
+    "enclosure": (("grid", "lower", "upper", "required"), "the Enclosure of enclose"),
     "convergence.study": (("errors", "fitted"), "the result of convergence_study"),
     "perturbation.study": (("nominal", "noise"), "the result of perturbation_study"),
 }
-PAIRS = ("convergence",)  # functions that accept two axes
+PAIRS = ("convergence", "enclosure")  # functions that accept two axes
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -164,9 +165,9 @@ def new_figure(size: tuple[float, float]) -> Figure:
     return pyplot.figure(figsize=size, layout="constrained")
 
 
-def pair_of_axes() -> list[Axes]:
-    """Two axes side by side with a common vertical scale, on a new figure."""
-    return [styled(ax) for ax in new_figure((8.0, 3.6)).subplots(1, 2, sharey=True)]
+def pair_of_axes(*, sharey: bool = True) -> list[Axes]:
+    """Two axes side by side on a new figure; they have a common vertical scale if ``sharey``."""
+    return [styled(ax) for ax in new_figure((8.0, 3.6)).subplots(1, 2, sharey=sharey)]
 
 
 def logarithmic(ax: Axes, places: np.ndarray | None = None) -> None:

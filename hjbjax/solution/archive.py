@@ -30,6 +30,34 @@ KINDS: dict[str, tuple[type, ...]] = {  # types in the header of a file, as JSON
 }
 
 
+def about_grid(grid: Grid) -> dict[str, Any]:
+    """The entries of a header that describe a grid, except its corners, which are arrays."""
+    return {
+        "shape": grid.shape,
+        "periodic": grid.periodic,
+        "edges": grid.edges,
+        "names": grid.names,
+        "units": grid.units,
+        "modes": grid.modes,
+        "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch],
+    }
+
+
+def grid_of(about: dict[str, Any], lo: np.ndarray, hi: np.ndarray) -> Grid:
+    """The grid with a description from a header and corners from a file; ``Grid`` checks its own arguments."""
+    stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
+    modes, edges = (
+        tuple(about.get("modes", ())),
+        about.get("edges", "projected"),
+    )  # in older files all ends are projected
+    rest = slice(1 if modes else 0, None)  # without the axis of modes
+    return with_modes(Grid(
+        lo[rest], hi[rest], tuple(about["shape"])[rest], about["periodic"][rest],
+        tuple(about["names"])[rest], stretch[rest], edges if isinstance(edges, str) else edges[rest],
+        tuple(about.get("units", ()))[rest],  # missing in older files, like the labels
+    ), modes)  # fmt: skip
+
+
 def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a solution.
 
@@ -40,15 +68,7 @@ def contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header = {
         "format": FORMAT,
         "version": VERSION,
-        "grid": {
-            "shape": grid.shape,
-            "periodic": grid.periodic,
-            "edges": grid.edges,
-            "names": grid.names,
-            "units": grid.units,
-            "modes": grid.modes,
-            "stretch": [s and [float(s.strength), float(s.center)] for s in grid.stretch],
-        },
+        "grid": about_grid(grid),
         "labels": solution.labels,
         "marched": None if solution.times is None else int(np.shape(solution.times)[0]),
         "isaacs_gap": np.asarray(solution.isaacs_gap).tolist(),
@@ -93,11 +113,17 @@ def feedback_contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarr
     return {**header, "arrays": sorted(found)}, found
 
 
+def shape_of(about: dict[str, Any]) -> tuple[int, ...]:
+    """The shape of a grid with a description from a header; refused before the sizes of arrays are computed."""
+    shape = tuple(about["shape"])
+    if not all(type(count) is int and count >= 2 for count in shape):
+        raise FileError(f"its grid has shape {shape}")
+    return shape
+
+
 def plan(header: dict) -> dict[str, Expected]:
     """Shapes and dtypes of the arrays in a file; they follow from the grid in its header."""
-    shape, marched = tuple(header["grid"]["shape"]), header["marched"]
-    if not all(type(count) is int and count >= 2 for count in shape):  # before computing array sizes
-        raise FileError(f"its grid has shape {shape}")
+    shape, marched = shape_of(header["grid"]), header["marched"]
     # None: any number of inputs or residuals; the kept times of a marched solution are the leading axis
     many, lead = (None,), () if marched is None else (marched,)
     controls = Expected((lead + shape + many, many * len(lead) + shape + many))
@@ -121,19 +147,8 @@ def plan(header: dict) -> dict[str, Expected]:
 
 
 def fields(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The arguments of ``Solution`` from the header and the arrays of a file; ``Grid`` checks its own arguments."""
-    about = header["grid"]
-    stretch = tuple(pair and Sinh(*pair) for pair in about["stretch"])
-    modes, edges = (
-        tuple(about.get("modes", ())),
-        about.get("edges", "projected"),
-    )  # in older files all ends are projected
-    rest = slice(1 if modes else 0, None)  # without the axis of modes
-    grid = with_modes(Grid(
-        arrays.pop("lo")[rest], arrays.pop("hi")[rest], tuple(about["shape"])[rest], about["periodic"][rest],
-        tuple(about["names"])[rest], stretch[rest], edges if isinstance(edges, str) else edges[rest],
-        tuple(about.get("units", ()))[rest],  # missing in older files, like the labels
-    ), modes)  # fmt: skip
+    """The arguments of ``Solution`` from the header and the arrays of a file."""
+    grid = grid_of(header["grid"], arrays.pop("lo"), arrays.pop("hi"))
     labels = labelling.of_file(header.get("labels", Labels()))
     header = {"monotone_error": None, **header}  # missing in older files
     for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``, because True is not a number of steps

@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 
 import hjbjax as hjb
-from hjbjax.enclosure.interpolant import Spline, axis_table
+from hjbjax.enclosure.interpolant import Spline
 
 BETA = 0.7
 
@@ -95,7 +95,7 @@ def test_the_value_of_a_random_problem_is_enclosed_and_the_bounds_close_with_the
 def test_a_spline_and_its_gradient_are_within_their_ranges_over_cells():
     draw = np.random.default_rng(3)
     grid = hjb.Grid([-1.0, 0.0], [2.0, 1.0], (7, 6), periodic=(False, True))
-    spline, values = Spline(tuple(axis_table(grid, axis) for axis in range(2))), draw.normal(size=grid.shape)
+    spline, values = Spline.on(grid), draw.normal(size=grid.shape)
     states = draw.uniform([-1.0, 0.01], [2.0, 0.99], (500, 2))
     index = [np.searchsorted(table.between, states[:, k], side="right") for k, table in enumerate(spline.tables)]
     w, p = spline.cells(index).scalars(values)

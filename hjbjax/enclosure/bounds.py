@@ -1,0 +1,157 @@
+"""The bounds as functions, and ``Enclosure``, the result of ``enclose``, with its files."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from hjbjax.enclosure.interpolant import Spline, axis_table
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.types import Numbers
+from hjbjax.solution import archive, files
+from hjbjax.solution.status import Status
+from hjbjax.tracing.intervals import point
+
+SIDES = ("lower", "upper")
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """One bound: the best of several shifted splines.
+
+    Attributes:
+      spline: the cells of the grid.
+      coefficients: of every spline, each (*grid).
+      shifts: the numbers that are subtracted from a lower bound, or added to an upper bound.
+      sign: 1 for a lower and −1 for an upper bound.
+    """
+
+    spline: Spline
+    coefficients: tuple[np.ndarray, ...]
+    shifts: tuple[float, ...]
+    sign: int
+
+    def at(self, states: np.ndarray) -> np.ndarray:
+        """The bound at states (count, n) inside the box, rounded to its side."""
+        best, places = np.full(len(states), -self.sign * np.inf), self.spline.at(states)
+        for values, shift in zip(self.coefficients, self.shifts, strict=True):
+            found = places.values(values)
+            if self.sign > 0:
+                best = np.maximum(best, (found - point(shift)).lo)
+            else:
+                best = np.minimum(best, (found + point(shift)).hi)
+        return best
+
+    def negative(self) -> "Bound":
+        """Minus the bound, which is a bound from the other side."""
+        return Bound(self.spline, tuple(-each for each in self.coefficients), self.shifts, -self.sign)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Enclosure(files.Saved):
+    """Two functions between which the value of the continuous problem lies; made by ``enclose``.
+
+    Args:
+      grid: the grid.
+      lower: the lower bound at the nodes, shape (*grid), in cost units.
+      upper: the upper bound at the nodes.
+      status: CONVERGED if the mean width is at most ``tol`` times the range of V, otherwise MAX_STEPS. The bounds hold
+        in both cases.
+      message: the problem that the bounds refer to, and their mean width.
+      stats: "seconds", "bytes" (the estimated memory) and "corrections".
+      remaining: e^{−βT} at the nodes, shape (*grid), where T is a lower bound of the time until a path can meet a
+        projected end. If the problem continues beyond the box, its value differs from the value between walls by at
+        most this factor times the largest difference at the ends. Zero without projected ends.
+      required: the shift that the cell around each node requires for the lower and for the upper bound before the
+        corrections, shape (2, *grid), in cost units. More nodes help most where it is large.
+      bounds: the lower and the upper bound as functions.
+    """
+
+    FORMAT = "hjbjax.Enclosure"
+
+    grid: Grid
+    lower: np.ndarray
+    upper: np.ndarray
+    status: Status
+    message: str
+    stats: dict
+    remaining: np.ndarray
+    required: np.ndarray
+    bounds: tuple[Bound, Bound] = dataclasses.field(repr=False)
+
+    @property
+    def width(self) -> np.ndarray:
+        """The upper minus the lower bound at the nodes, shape (*grid)."""
+        return self.upper - self.lower
+
+    def lower_at(self, x: Numbers | Sequence) -> Any:
+        """The lower bound between the nodes.
+
+        Args:
+          x: states, shape (n,) or (..., n).
+
+        Returns:
+          Shape (...), in cost units; NaN outside the box.
+        """
+        return self._at("lower_at", 0, x)
+
+    def upper_at(self, x: Numbers | Sequence) -> Any:
+        """The upper bound between the nodes; see ``lower_at``."""
+        return self._at("upper_at", 1, x)
+
+    def _at(self, name: str, side: int, x: Numbers | Sequence) -> Any:
+        states, n = np.asarray(x, float), self.grid.ndim
+        if states.ndim == 0 or states.shape[-1] != n:
+            raise ValueError(f"Enclosure.{name}: got states of shape {states.shape}, wanted (..., {n})")
+        flat = states.reshape(-1, n)
+        lo, hi = np.asarray(self.grid.lo, float), np.asarray(self.grid.hi, float)
+        cyclic = np.array(self.grid.periodic)
+        flat = np.where(cyclic & ((flat < lo) | (flat > hi)), lo + np.mod(flat - lo, hi - lo), flat)
+        inside = np.all((flat >= lo) & (flat <= hi), axis=-1)
+        found = np.full(len(flat), np.nan)
+        if np.any(inside):
+            found[inside] = self.bounds[side].at(flat[inside])
+        return found.reshape(states.shape[:-1])
+
+    def __repr__(self) -> str:
+        return f"Enclosure({self.status}, largest width {np.max(self.width):.3g} on {self.grid.size} nodes)"
+
+    def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        header = {
+            "grid": archive.about_grid(self.grid), "code": int(self.status), "message": self.message,
+            "stats": self.stats, "splines": [len(each.shifts) for each in self.bounds],
+        }  # fmt: skip
+        names = ("lower", "upper", "remaining", "required")
+        arrays = {"lo": self.grid.lo, "hi": self.grid.hi, **{name: getattr(self, name) for name in names}}
+        # the bounds are proved for these very numbers, which another machine may compute differently
+        arrays |= {f"axis{axis}": table.at for axis, table in enumerate(self.bounds[0].spline.tables)}
+        for name, bound in zip(SIDES, self.bounds, strict=True):
+            arrays[f"{name}_coefficients"] = np.stack(bound.coefficients)
+            arrays[f"{name}_shifts"] = np.array(bound.shifts)
+        return header, arrays
+
+    @staticmethod
+    def _plan(header: dict) -> dict[str, files.Expected]:
+        """The arrays of a file; their shapes follow from its grid and the number of splines."""
+        shape, cyclic = archive.shape_of(header["grid"]), header["grid"]["periodic"]
+        shapes: dict[str, tuple[int, ...]] = {name: (len(shape),) for name in ("lo", "hi")}
+        shapes |= {**dict.fromkeys(("lower", "upper", "remaining"), shape), "required": (2, *shape)}
+        shapes |= {f"axis{axis}": (count + bool(cyclic[axis]),) for axis, count in enumerate(shape)}
+        for name, count in zip(SIDES, header["splines"], strict=True):
+            shapes |= {f"{name}_coefficients": (count, *shape), f"{name}_shifts": (count,)}
+        return {name: files.Expected((each,), (np.float64,), optional=False) for name, each in shapes.items()}
+
+    @classmethod
+    def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
+        """The enclosure with a header and arrays of a file."""
+        grid = archive.grid_of(header["grid"], arrays["lo"], arrays["hi"])
+        spline = Spline(tuple(axis_table(arrays[f"axis{k}"], cyclic) for k, cyclic in enumerate(grid.periodic)))
+        lower, upper = (
+            Bound(spline, tuple(arrays[f"{name}_coefficients"]), tuple(arrays[f"{name}_shifts"].tolist()), sign)
+            for name, sign in zip(SIDES, (1, -1), strict=True)
+        )
+        return cls(
+            grid, arrays["lower"], arrays["upper"], Status(header["code"]), header["message"], header["stats"],
+            arrays["remaining"], arrays["required"], (lower, upper),
+        )  # fmt: skip

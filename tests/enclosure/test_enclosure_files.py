@@ -1,0 +1,110 @@
+"""Files and pictures of an enclosure, and the region in which narrow bounds are wanted."""
+
+import numpy as np
+import pytest
+from pictures import pictures as plotting
+
+import hjbjax as hjb
+from hjbjax.solution.placement import FileError
+
+LINE = hjb.Problem(lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-3.0], [3.0]), discount=1.0)
+EXACT = (5**0.5 - 1) / 2  # V = EXACT x²
+
+
+def near(grid, value):
+    return hjb.Solution(grid, value(grid.nodes()), None, code=hjb.Status.CONVERGED)
+
+
+@pytest.fixture(scope="module")
+def found():
+    grid = hjb.Grid([-1.0], [1.0], (21,), names=("position",), units=("m",), stretch=(hjb.Sinh(2.0, 0.3),))
+    return hjb.enclose(LINE, near(grid, lambda x: EXACT * x[..., 0] ** 2), rounds=2)
+
+
+@pytest.fixture(scope="module")
+def plane():
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: 2 + u @ u, hjb.Box([-1.0, -1.0], [1.0, 1.0]), discount=1.0)
+    grid = hjb.Grid([0.0, 0.0], [1.0, 2.0], (6, 7), (True, False), names=("a", "b"))
+    return hjb.enclose(problem, near(grid, lambda x: 2 + 0.01 * x[..., 1] ** 2), rounds=1)
+
+
+def test_an_enclosure_is_read_from_its_file_bit_by_bit(found, plane, tmp_path):
+    for each in (found, plane):
+        path = tmp_path / f"{each.grid.ndim}.npz"
+        each.save(path)
+        again = hjb.Enclosure.load(path)
+        states = np.random.default_rng(0).uniform(each.grid.lo, each.grid.hi, (200, each.grid.ndim))
+        for name in ("lower", "upper", "remaining", "required"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(each, name))
+        np.testing.assert_array_equal(again.lower_at(states), each.lower_at(states))
+        np.testing.assert_array_equal(again.upper_at(states), each.upper_at(states))
+        assert repr(again.grid) == repr(each.grid)
+        assert (again.status, again.message, again.stats) == (each.status, each.message, each.stats)
+    with pytest.raises(FileExistsError):
+        found.save(path)
+    with pytest.raises(FileError, match="another program"):
+        hjb.Enclosure.load(_foreign(tmp_path))
+
+
+def _foreign(folder):
+    path = folder / "solution.npz"
+    near(hjb.Grid([0.0], [1.0], (3,)), lambda x: x[..., 0]).save(path)
+    return path
+
+
+def test_the_largest_required_shift_is_that_of_the_first_candidate(found):
+    for required, bound in zip(found.required, found.bounds, strict=True):
+        assert np.max(required) == bound.shifts[0]
+
+
+def test_the_picture_over_one_axis_has_both_bounds_and_the_width(found):
+    lower, upper, _, width, below, above = plotting.enclosure(found)
+    np.testing.assert_array_equal(lower.get_ydata(), found.lower)
+    np.testing.assert_array_equal(upper.get_ydata(), found.upper)
+    np.testing.assert_array_equal(width.get_ydata(), found.width)
+    for line, required in zip((below, above), found.required, strict=True):
+        np.testing.assert_array_equal(line.get_ydata(), np.maximum(required, 0))
+    assert lower.axes.get_xlabel() == "position [m]"
+    assert (lower.axes.get_ylabel(), width.axes.get_ylabel()) == ("V", "width")
+    assert len(plotting.enclosure(found, ax=lower.axes)) == 3
+
+
+def test_the_picture_over_two_axes_marks_the_cells_that_widen_the_bounds(plane):
+    lower, upper, mesh, *dots = plotting.enclosure(plane, colorbar=False)
+    np.testing.assert_array_equal(lower.levels, upper.levels)
+    np.testing.assert_array_equal(np.ma.asarray(mesh.get_array()).T[:-1], plane.width)  # closed at the seam
+    for marks, required in zip(dots, plane.required, strict=True):
+        places = np.column_stack(marks.get_data())
+        wanted = plane.grid.nodes()[required >= 0.5 * np.max(required)]
+        assert {tuple(each) for each in wanted} <= {tuple(each) for each in places}
+    cut = plotting.enclosure(plane, fixed={"b": 1.0})[0]
+    np.testing.assert_allclose(cut.get_ydata()[:-1], plane.lower[:, 3])
+    with pytest.raises(TypeError, match="the Enclosure of enclose"):
+        plotting.enclosure(plane.grid)
+
+
+def test_corrections_end_once_the_bounds_are_narrow_in_the_region():
+    """V bends at the wall at −1, and not in the region."""
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: (x[0] - 0.9) ** 2 + u @ u, hjb.Box([-2.0], [2.0]), discount=1.0)
+    grid = hjb.Grid([-1.0], [1.0], (41,))
+    solution = near(grid, lambda x: 0.6 * (x[..., 0] - 0.9) ** 2)
+    whole = hjb.enclose(problem, solution, tol=2e-3)
+    part = hjb.enclose(problem, solution, region=([-0.5], [0.5]), tol=2e-3)
+    inside = np.abs(np.asarray(grid.axis(0))) <= 0.5
+    masked = hjb.enclose(problem, solution, region=inside, tol=2e-3)
+    np.testing.assert_array_equal(part.lower, masked.lower)
+    assert part.stats["corrections"] <= whole.stats["corrections"]
+    assert part.status is hjb.Status.CONVERGED
+    assert "in the region" in part.message
+    assert np.all(part.lower <= whole.upper)
+    assert np.all(whole.lower <= part.upper)
+
+
+@pytest.mark.parametrize(
+    ("region", "reason"),
+    [(np.ones(4, bool), "wanted a pair of corners"), ([[3.0], [4.0]], "contains no node"), (1.0, "wanted a pair")],
+)
+def test_a_region_that_is_not_one_is_refused(region, reason):
+    solution = near(hjb.Grid([-1.0], [1.0], (9,)), lambda x: x[..., 0] ** 2)
+    with pytest.raises(ValueError, match=reason):
+        hjb.enclose(LINE, solution, region=region)

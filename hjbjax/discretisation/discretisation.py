@@ -21,7 +21,8 @@ from hjbjax.discretisation.paths import Paths
 from hjbjax.discretisation.players import Players, find_players
 from hjbjax.discretisation.stencil import Links
 from hjbjax.problem import sets
-from hjbjax.problem.grid import Grid
+from hjbjax.problem.grid import Grid, placed
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, pytree_dataclass
 from hjbjax.tracing import components, dependence
@@ -184,6 +185,10 @@ class Discretisation:
     def on_grid(self, grid: Grid) -> "Discretisation":
         """The discretisation on another grid."""
         return dataclasses.replace(self, grid=grid)
+
+    def on_part(self, layout: Layout) -> "Discretisation":
+        """The discretisation of the nodes of one device, inside ``shard_map`` if they are divided."""
+        return altered(self, grid=placed(self.grid, layout))
 
     @functools.cached_property
     def players(self) -> Players:

@@ -7,8 +7,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.problem.grid import Grid, placed
-from hjbjax.problem.layouts import Layout, Parts
+from hjbjax.problem.grid import Grid, division
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 
@@ -44,12 +44,11 @@ class GridTask:
     @property
     def division(self) -> Layout:
         """The layout of the iteration: parts over the mesh; one device without a mesh, or if the grid is too small."""
-        parts = None if self.mesh is None else Parts(self.grid.shape, self.mesh)
-        return parts if parts is not None and parts.fits else self.layout
+        return division(self.grid, self.mesh)
 
     def on_part(self: T, layout: Layout) -> T:
         """The task on the nodes of one device, inside ``shard_map`` if they are divided."""
-        return altered(self, on=altered(self.on, grid=placed(self.grid, layout)))
+        return altered(self, on=self.on.on_part(layout))
 
     def over_nodes(self: T, shape: tuple[int, ...]) -> T:
         """A tree of bools, True for leaves with a value at every node, that is, leaves of this ``shape``."""

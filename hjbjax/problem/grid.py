@@ -14,11 +14,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.problem import arguments
 from hjbjax.problem.ends import PRESCRIBED, on_face
 from hjbjax.problem.labels import with_unit, words
-from hjbjax.problem.layouts import Layout
+from hjbjax.problem.layouts import Layout, Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
 from hjbjax.problem.types import Array, DType, Number, Numbers, States
@@ -352,6 +353,12 @@ def with_prescriptions(grid: Grid, change: Callable[[Any], Any]) -> Grid:
 def placed(grid: Grid, layout: Layout) -> Grid:
     """The grid of the nodes that a layout places on this device, with the shape of its arrays."""
     return altered(grid, shape=layout.shape, _layout=layout)
+
+
+def division(grid: Grid, mesh: Mesh | None) -> Layout:
+    """The layout of a grid over the devices of a mesh; one device without a mesh, or if a part would be too small."""
+    parts = None if mesh is None else Parts(grid.shape, mesh)
+    return parts if parts is not None and parts.fits else grid.layout
 
 
 def undivided(grid: Grid) -> Grid:

@@ -124,6 +124,10 @@ class Layout:
         """
         return tree
 
+    def copied(self, tree: T) -> T:
+        """Copy arrays to every device."""
+        return tree
+
     def gathered(self, tree: T, over_nodes: Any) -> T:
         """The inverse of ``spread``: NumPy arrays of the whole grid if it is divided."""
         return tree
@@ -197,6 +201,10 @@ class Parts(Layout):
             )
 
         return jax.tree.map(put, tree, over_nodes)
+
+    def copied(self, tree: T) -> T:
+        """Copy arrays to every device."""
+        return self.spread(tree, jax.tree.map(lambda _: False, tree))
 
     def gathered(self, tree: T, over_nodes: Any) -> T:
         """The inverse of ``spread``: NumPy arrays of the whole grid."""

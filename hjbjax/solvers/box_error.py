@@ -168,7 +168,7 @@ def _other_free_ends(level: Task) -> tuple:
 
 def _coarse_task(task: Task) -> Task | None:
     """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
-    level = dataclasses.replace(task, on=task.on.chain, mesh=None)
+    level = dataclasses.replace(task, on=task.on.chain)
     wanted = int(np.clip(task.grid.size // SHARE, FEWEST, MOST))
     while level.grid.size > wanted:
         coarse = nested_grids.coarser(level.grid, INTERVALS)
@@ -176,7 +176,8 @@ def _coarse_task(task: Task) -> Task | None:
         if smaller is None:
             break
         level = smaller
-    return level if level.grid.size <= FACTORED and level.grid.ndim < 6 else None
+    fits = level.grid.size <= FACTORED and level.grid.ndim < 6
+    return dataclasses.replace(level, mesh=None) if fits else None
 
 
 def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:

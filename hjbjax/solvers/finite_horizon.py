@@ -177,7 +177,7 @@ def march(
         check_on_one_state(problem, grid, scheme)
         on = Discretisation(problem, grid, scheme, kind)
         asked = _Asked(on, horizon, kept, start, method, step, inner, policy, mesh)
-        needed = memory.fitting(memory.of_march(on, len(kept), method, policy=policy), grid, max_memory)
+        needed = memory.fitting(memory.of_march(on, len(kept), method, policy=policy), grid, max_memory, mesh)
         with host_loop.with_solution(clock, needed, lambda _: _solution_at_horizon(asked, Status.INTERRUPTED)):
             solution = _with_estimates(asked, clock)
     solution = with_last_phase(solution, clock)  # after the last write of the checkpoint, which may take long
@@ -255,17 +255,17 @@ def _on_host(asked: _Asked, clock: Clock) -> tuple[March, Solution]:
       Stopped: the clock stopped the march before the first step.
     """
     on, horizon = asked.on, asked.horizon
-    _check_nodes(on, horizon, clock)
+    _check_nodes(on, horizon, clock, asked.mesh)
     task = _prepare(on, horizon, asked.method, asked.step, asked.inner, policy=asked.policy, mesh=asked.mesh)
     slices, front, code = march_run.drive_march(task, horizon, asked.kept, asked.start, clock)
     return task, march_run.assemble(task, on.grid, slices, front, code)
 
 
-def _check_nodes(on: Discretisation, horizon: float, clock: Clock) -> None:
+def _check_nodes(on: Discretisation, horizon: float, clock: Clock, mesh: Mesh | None) -> None:
     """Check the values of the problem's functions at all nodes, then leave the clock at the preparation."""
     problem = on.problem
     exact.check_unbounded(on)
-    node_checks.check_values(on.asking(_without_moving_target(problem)), clock)
+    node_checks.check_values(on.asking(_without_moving_target(problem)), clock, mesh)
     # a drift that depends on time may respect a constrained end at one time and not at another
     for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
         admissibility.check_constrained_ends(problem, on.grid, on.dtype, t)

@@ -112,7 +112,7 @@ def settled_on_host(
     try:
         # from cheap to expensive: all nodes, the ends of the box, then everything that is compiled for the grid
         exact.check_unbounded(on, relaxes=method.inner.relaxes)
-        node_checks.check_values(on, clock)
+        node_checks.check_values(on, clock, mesh)
         admissibility.check_constrained_ends(problem, grid, on.dtype)
         sharpen = choices.scheme
         if sharpen:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
@@ -145,13 +146,14 @@ def _searched(problem: Problem, n: int, dtype: DType) -> int:
     return max(words, default=0)
 
 
-def available() -> int | None:
-    """Free bytes on the device that JAX computes on; None if unknown."""
-    device = jax.devices()[0]
-    # on a CPU the operating system reports the free memory, below
-    stats = device.memory_stats() if device.platform != "cpu" else None
-    if stats and "bytes_limit" in stats:
-        return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
+def available(mesh: Mesh | None = None) -> int | None:
+    """Free bytes on the device that JAX computes on, or on all devices of a mesh together; None if unknown."""
+    devices = jax.devices()[:1] if mesh is None else mesh.local_devices
+    # on a CPU the operating system reports the free memory, below; all devices of a CPU share it
+    stats = [device.memory_stats() for device in devices if device.platform != "cpu"]
+    if stats and all(each and "bytes_limit" in each for each in stats):
+        least = min(int(each["bytes_limit"]) - int(each.get("bytes_in_use", 0)) for each in stats)
+        return least * (1 if mesh is None else mesh.size)  # each device gets an equal share of the nodes
     known = [free for free in (_of_machine(), _of_process(), _of_groups()) if free is not None]
     return max(min(known), 0) if known else None
 
@@ -223,17 +225,24 @@ def _reclaimable(folder: Path) -> int:
 
 
 def require(
-    problem: Problem, grid: Grid, method: Method, dtype: DType, limit: int | None, *, high_order: bool = False
+    problem: Problem,
+    grid: Grid,
+    method: Method,
+    dtype: DType,
+    limit: int | None,
+    *,
+    high_order: bool = False,
+    mesh: Mesh | None = None,
 ) -> int:
-    """The estimated bytes of a solve, if they fit.
+    """The estimated bytes of a solve, on all devices of a mesh together, if they fit.
 
     Raises:
       MemoryError: the bytes do not fit; reports the estimate, the free memory, and the largest N that fits.
     """
-    return fitting(peak_bytes(problem, grid, method, dtype, high_order=high_order), grid, limit)
+    return fitting(peak_bytes(problem, grid, method, dtype, high_order=high_order), grid, limit, mesh)
 
 
-def fitting(needed: int, grid: Grid, limit: int | None) -> int:
+def fitting(needed: int, grid: Grid, limit: int | None, mesh: Mesh | None = None) -> int:
     """Return ``needed`` bytes if they fit into the free memory, or into ``limit``; raises as ``require`` does.
 
     Raises:
@@ -241,7 +250,7 @@ def fitting(needed: int, grid: Grid, limit: int | None) -> int:
     """
     if limit is not None:
         arguments.positive(limit, "max_memory", "in bytes")
-    free = available() if limit is None else int(limit)
+    free = available(mesh) if limit is None else int(limit)
     checks.check_indices(grid)
     # memory is proportional to the number of nodes
     if free is not None and needed > free:

@@ -1,6 +1,9 @@
 """From a problem on a grid to a task: fixed nodes, counted nodes, certificate and method."""
 
 import dataclasses
+import functools
+import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +20,9 @@ from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.iteration.methods import Method, Nested, PolicyIteration, ValueIteration
-from hjbjax.problem.grid import Grid, tabulated
+from hjbjax.problem.grid import Grid, division, tabulated
 from hjbjax.problem.labels import COST
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.problem import Problem, is_constrained, is_discounted
 from hjbjax.problem.pytree import altered, cast, known
 from hjbjax.problem.types import Mask, Number, Scalar
@@ -151,7 +155,7 @@ def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "As
 
 def stores_links(on: Discretisation) -> bool:
     """True if a program stores the links cut by a target: the grid is small enough."""
-    return on.cuts_links and on.grid.size <= LINKS
+    return on.cuts_links and math.prod(on.grid.layout.whole) <= LINKS
 
 
 def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Standstill | None) -> Scalar | None:
@@ -162,11 +166,11 @@ def _floor(on: Discretisation, obstacles: bellman.Obstacles, still: resting.Stan
     """
     if still is None or is_constrained(on.problem):
         return None
-    costs = jnp.where(jnp.isfinite(still.least), still.least, 0)
-    small = resting.ROUNDINGS * jnp.finfo(on.dtype).eps * jnp.max(jnp.abs(costs))
-    ends = certificates.lowest_end(obstacles, jnp.ones(on.grid.shape, bool), on.grid.layout)
+    costs, layout = jnp.where(jnp.isfinite(still.least), still.least, 0), on.grid.layout
+    small = resting.ROUNDINGS * jnp.finfo(on.dtype).eps * layout.largest(jnp.abs(costs))
+    ends = certificates.lowest_end(obstacles, jnp.ones(on.grid.shape, bool), layout)
     # finite, since values are compared with a multiple of it
-    return jnp.where(jnp.all(costs >= -small), ends, jnp.finfo(on.dtype).min / 8).astype(on.dtype)
+    return jnp.where(~layout.some(~(costs >= -small)), ends, jnp.finfo(on.dtype).min / 8).astype(on.dtype)
 
 
 def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.Obstacles, resting.Standstill | None]:
@@ -174,7 +178,7 @@ def _obstacles(on: Discretisation, assumptions: "Assumptions") -> tuple[bellman.
     obstacles, problem = bellman.obstacles(on), on.problem
     if on.scheme.subcell and problem.exit_cost is not None:
         ends = (meets for link in on.links for meets in (link.meets_up, link.meets_down))
-        met = [jnp.min(jnp.where(*meets, 0)) for meets in ends if meets]
+        met = [on.grid.layout.least(jnp.where(*meets, 0)) for meets in ends if meets]
         # a lower bound on V must not exceed any exit cost, also where the boundary is between the nodes
         obstacles = dataclasses.replace(obstacles, least_exit=jnp.minimum(jnp.min(jnp.stack(met)), 0))
     if not (assumptions.may_rest or assumptions.costs_certify):
@@ -229,14 +233,30 @@ def assumptions_of(on: Discretisation) -> Assumptions:
     return Assumptions(Certificate.BY_DISCOUNT if discounted is None else kind, players.exact, may_rest, fits)
 
 
-_prepare_jit = jax.jit(prepare, static_argnames="assumptions")
+@functools.partial(jax.jit, static_argnames=("assumptions", "layout"))
+def _prepare_jit(on: Discretisation, method: Method, tol: Number, *, assumptions: Assumptions, layout: Layout) -> Task:
+    """``prepare`` for the nodes of all devices at once."""
+
+    def here(on: Discretisation, method: Method, tol: Number) -> Task:
+        made = prepare(on.on_part(layout), method=method, tol=tol, assumptions=assumptions)
+        return altered(made, on=altered(made.on, grid=on.grid))  # the same on every device
+
+    marks: Any = None
+    if layout.axes:
+        whole = jax.eval_shape(functools.partial(prepare, assumptions=assumptions), on, method=method, tol=tol)
+        marks = whole.over_nodes(on.grid.shape)
+    return layout.mapped(here, False, marks)(on, method, tol)
 
 
 def prepared(
     on: Discretisation, *, method: Method, tol: Number, assumptions: Assumptions, mesh: Mesh | None = None
 ) -> Task:
     """The task of ``prepare`` at host level, with spacings and coordinates as constants of the program."""
-    made = _prepare_jit(on.on_grid(tabulated(on.grid)), method=method, tol=tol, assumptions=assumptions)
+    layout = division(on.grid, mesh)
+    there, how = layout.copied((on.on_grid(tabulated(on.grid)), method))
+    made = _prepare_jit(there, how, tol, assumptions=assumptions, layout=layout)
+    if layout.axes:
+        made = layout.gathered(made, made.over_nodes(layout.entries))
     grid = jax.tree.map(lambda leaf: np.asarray(leaf, on.dtype), on.grid)
     return altered(made, on=altered(made.on, grid=grid), mesh=mesh)
 
@@ -284,7 +304,9 @@ def prepare_on_host(
     # finite
     if problem.is_game or is_constrained(problem) or not held.any():
         return task, assumptions, None
-    reach = attainability.reached(task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock)
+    reach = attainability.reached(
+        task.on, held, surely=undiscounted, least=_least_rate(task), clock=clock, layout=task.division
+    )
     if undiscounted and not reach.surely.all():
         task = _finite_part(task, reach.surely)
     return task, assumptions, reach

@@ -169,7 +169,7 @@ def solve(
         clock.journal = kept and kept.journal()
         check_on_one_state(problem, grid, on.scheme)  # before the memory check, which reads functions
         needed = memory.require(
-            problem, grid, method, kind, max_memory, high_order=may_raise_order(problem, method, scheme)
+            problem, grid, method, kind, max_memory, high_order=may_raise_order(problem, method, scheme), mesh=mesh
         )
         with host_loop.with_solution(clock, needed, lambda kept: _partial(on, kept)):
             solution = solve_on_host(on, method, tol, guess, clock, choices, mesh)

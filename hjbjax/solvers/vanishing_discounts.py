@@ -4,7 +4,6 @@ If an undiscounted problem is iterated from zero, its policies stay where they a
 they move to the target. A stopping cost or a running maximum is a start itself: ψ is above all fixed points, g below.
 """
 
-import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.iteration.certificates import Certificate
@@ -23,7 +22,7 @@ def warm(task: Task, guess: Nodes | None, clock: Clock) -> Nodes:
     """The guess if there is one; else zero, or without discount a start that leads to the right fixed point."""
     if guess is not None:
         return guess
-    value = task.start() if task.constrained else jnp.asarray(np.zeros(task.grid.shape, task.tol.dtype))
+    value = task.start() if task.constrained else np.zeros(task.grid.shape, task.tol.dtype)
     return follow(task, value, VANISHING, clock) if needs_a_way(task) else value
 
 

@@ -10,7 +10,7 @@ however long.
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +23,12 @@ from hjbjax.discretisation.rates import Rates, jump_rates
 from hjbjax.hamiltonian.search import Action
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.types import Array, Mask, Number, Scalar
 from hjbjax.solution.clock import Clock
 from hjbjax.well_posedness import tried_actions
 
+T = TypeVar("T")
 FEW = 9  # actions per player in a game, where all pairs are tried
 WINDING = 30  # rounds of sweeps before a graph search takes over; each round follows paths around one more corner
 SEARCHABLE = 5 * 10**7  # largest number of jumps for a graph search, at some 60 bytes each
@@ -34,21 +36,36 @@ LOOK = 10**7  # nodes times actions between two checks of the clock: about a sec
 
 
 def _open_jumps(
-    on: Discretisation, points: Array, count: int, clock: Clock, inside: jax.Array | None, *, least: Number, kinks: bool
+    on: Discretisation,
+    points: Array,
+    count: int,
+    clock: Clock,
+    inside: np.ndarray | None,
+    *,
+    least: Number,
+    kinks: bool,
+    layout: Layout,
 ) -> Rates:
     """For every jump, the nodes with an action that makes this jump and whose jumps all stay ``inside``, bool (*grid).
 
     Tries the first ``count`` actions of ``points``. ``inside=None`` means the box. Rates up to ``least`` count as
     rounding. With ``kinks``, the actions between samples at which a component of the drift vanishes are tried too.
     """
-    known = _no_jumps(on, points)
-    some = max(1, LOOK // on.grid.size)
+    none, some = _no_jumps(on, points), max(1, LOOK // on.grid.size)
+    known, places = layout.spread(none, _over_nodes(none)), layout.spread(inside, _over_nodes(inside))
+    on = layout.copied(on)
     for first in range(0, count, some):
         clock.enter(f"the jumps of the chain, {first} of {count} actions")
         lot = first, min(first + some, count)
         # these additional actions do not depend on the samples, so they are tried once, with the first batch
-        known = _more_open_jumps(on, inside, known, points, lot, least=least, kinks=kinks, others=kinks and first == 0)
-    return known
+        others = kinks and first == 0
+        known = _more_open_jumps(on, places, known, points, lot, least, kinks=kinks, others=others, layout=layout)
+    return layout.gathered(known, _over_nodes(known))
+
+
+def _over_nodes(tree: T) -> T:
+    """A tree of the same structure that marks every leaf as one value per node."""
+    return jax.tree.map(lambda _: True, tree)
 
 
 @jax.jit  # only traced, and executed for jumps of the state
@@ -69,15 +86,37 @@ def _no_jumps(on: Discretisation, points: Array) -> Rates:
     return Rates(offsets, (none,) * len(offsets), landings=far)
 
 
-@functools.partial(jax.jit, static_argnames=("kinks", "others"))
+@functools.partial(jax.jit, static_argnames=("kinks", "others", "layout"))
 def _more_open_jumps(
     on: Discretisation,
     inside: jax.Array | None,
     known: Rates,
     points: Array,
     lot: tuple[int, int],
-    *,
     least: Number,
+    *,
+    kinks: bool,
+    others: bool,
+    layout: Layout,
+) -> Rates:
+    """``_opened`` for the nodes of all devices."""
+
+    def here(on: Discretisation, *arguments: Any) -> Rates:
+        return _opened(on.on_part(layout), *arguments, kinks=kinks, others=others)
+
+    divided = _over_nodes(known)
+    marks = (False, _over_nodes(inside), divided, False, False, False)
+    return layout.mapped(here, marks, divided)(on, inside, known, points, lot, least)
+
+
+def _opened(
+    on: Discretisation,
+    inside: jax.Array | None,
+    known: Rates,
+    points: Array,
+    lot: tuple[int, int],
+    least: Number,
+    *,
     kinks: bool,
     others: bool,
 ) -> Rates:
@@ -135,7 +174,13 @@ class Reach(NamedTuple):
 
 
 def reached(
-    on: Discretisation, held: np.ndarray, *, surely: bool, least: Number = 0.0, clock: Clock | None = None
+    on: Discretisation,
+    held: np.ndarray,
+    *,
+    surely: bool,
+    least: Number = 0.0,
+    clock: Clock | None = None,
+    layout: Layout | None = None,
 ) -> Reach:
     """The nodes from which the fixed nodes can be reached; host level, for problems with one player.
 
@@ -146,6 +191,7 @@ def reached(
         nodes that may reach them.
       least: a rate per unit time; jumps at rates up to it count as rounding.
       clock: the limits; raises ``Stopped`` when they are exceeded.
+      layout: the devices that compute the jumps, each at its own nodes; None for one device.
     """
     on = on.on_grid(stencil.walled(on.grid))  # a path that leaves through an open end may not return
     clock, found, maybe = clock or Clock(), np.zeros(on.grid.shape, bool), np.zeros(on.grid.shape, bool)
@@ -156,7 +202,10 @@ def reached(
     # A few actions suffice for most problems. Nodes that samples do not reach may be reached by an action that keeps
     # exactly to a path. Every pass uses admissible actions only, so the union of the passes is also reachable.
     for count, kinks in dict.fromkeys([(few, False), (len(points), False), (len(points), True)]):
-        jumps = functools.partial(_open_jumps, on, points=points, count=count, clock=clock, least=least, kinks=kinks)
+        jumps = functools.partial(
+            _open_jumps, on, points=points, count=count, clock=clock, least=least, kinks=kinks,
+            layout=layout or on.grid.layout,
+        )  # fmt: skip
         more = _reached_by(jumps, _interventions(on), held, surely, on.grid, clock)
         found, maybe = found | more.surely, maybe | more.maybe
         if found.all():
@@ -175,12 +224,12 @@ def _interventions(on: Discretisation) -> Rates:
 _interventions_jit = jax.jit(Discretisation.interventions)
 
 
-def _led_inside(changes: Rates, inside: jax.Array | None, grid: Grid) -> list[np.ndarray]:
+def _led_inside(changes: Rates, inside: np.ndarray | None, grid: Grid) -> list[np.ndarray]:
     """The interventions that lead ``inside``, bool (*grid) each."""
     if inside is None:
         return list(changes.values)
     return [
-        each & np.asarray(stencil.neighbour(inside, grid, offset))
+        each & np.asarray(stencil.neighbour(jnp.asarray(inside), grid, offset))
         for offset, each in zip(changes.offsets, changes.values, strict=True)
     ]
 
@@ -190,7 +239,7 @@ def _reached_by(
 ) -> Reach:
     """The nodes from which the fixed nodes are reached by ``open_jumps(inside=...)`` and by interventions."""
 
-    def staying(inside: jax.Array | None) -> np.ndarray:
+    def staying(inside: np.ndarray | None) -> np.ndarray:
         jumps = open_jumps(inside=inside)
         leading = (*jumps.values, *_led_inside(changes, inside, grid))
         jumps = Rates((*jumps.offsets, *changes.offsets), leading, landings=jumps.landings)
@@ -201,7 +250,7 @@ def _reached_by(
     while surely and not np.array_equal(found, inside):
         inside = found
         # nodes are removed and never restored, as for any largest fixed point, so at most one round per node
-        found = inside & staying(jnp.asarray(inside))
+        found = inside & staying(inside)
     return Reach(found, maybe)
 
 

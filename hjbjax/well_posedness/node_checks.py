@@ -12,12 +12,14 @@ from typing import Any, NamedTuple, NoReturn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from hjbjax.discretisation import correlated_noise, schemes, stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
-from hjbjax.problem.grid import Grid, tabulated
+from hjbjax.problem.grid import Grid, division, tabulated
+from hjbjax.problem.layouts import Layout
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.settings import own_settings
@@ -32,13 +34,15 @@ ROUNDING = 16  # units of eps of the largest rate: a smaller negative rate is ro
 LOOK = 10**7  # nodes times actions between two checks of the clock: about a second for a drift with some sines
 
 
-def check_values(on: Discretisation, clock: Clock | None = None) -> None:
+def check_values(on: Discretisation, clock: Clock | None = None, mesh: Mesh | None = None) -> None:
     """Refuse a problem by its values at the nodes: NaN, an empty target, noise or drift that no chain can represent.
 
     Args:
       on: the problem on its grid; must have passed ``checks.shapes``. The functions are evaluated in its dtype. The
         chain is checked too if it is a custom one.
       clock: checks the limits between batches of actions; raises ``Stopped``.
+      mesh: the devices over which the nodes are divided; None for one device. A problem that is refused is evaluated on
+        one device, for the message.
 
     Raises:
       ValueError: a value is refused; names the number of nodes, the first one with its state, and a remedy.
@@ -55,7 +59,7 @@ def check_values(on: Discretisation, clock: Clock | None = None) -> None:
             _check_round_trips(np.asarray(_switching_costs(on)), grid)
         if problem.push_steps:
             _check_pushes(on)
-        if _all_pass(on, actions, clock):
+        if _all_pass(on, actions, clock, division(grid, mesh)):
             return
         clock.look()
         found = jax.device_get(_survey(on, actions))
@@ -179,21 +183,30 @@ def _representatives(admissible: sets.AdmissibleSet | None, most: int) -> np.nda
     return points[np.unique(np.linspace(0, len(points) - 1, min(most, len(points))).round().astype(int))]
 
 
-def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock: Clock) -> bool:
+def _all_pass(on: Discretisation, actions: tuple[np.ndarray, np.ndarray], clock: Clock, layout: Layout) -> bool:
     """True if ``check_values`` refuses nothing; evaluates the actions in batches."""
-    count, some = len(actions[0]), max(1, LOOK // on.grid.size)
+    count, some, on = len(actions[0]), max(1, LOOK // on.grid.size), layout.copied(on)
     # In batches of about a second, as ten million nodes and 33 actions take half a minute. All batches use one program,
     # because first and last are arguments.
     for first in range(0, count, some):
         clock.enter(f"the survey of the nodes, {first} of {count} actions")
-        if not _actions_pass(on, actions, first, min(first + some, count)):
+        if not _actions_pass(on, actions, first, min(first + some, count), layout=layout):
             return False
     return True
 
 
-@jax.jit
-def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar) -> Verdict:
+@functools.partial(jax.jit, static_argnames="layout")
+def _actions_pass(
+    on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar, *, layout: Layout
+) -> Verdict:
+    """``_part_passes`` for the nodes of all devices."""
+    here: Callable[..., Verdict] = lambda on, *arguments: _part_passes(on.on_part(layout), *arguments)  # noqa: E731
+    return layout.mapped(here, False, False)(on, actions, first, last)
+
+
+def _part_passes(on: Discretisation, actions: tuple[Array, Array], first: Scalar, last: Scalar) -> Verdict:
     """The verdict on the actions ``first``, …, ``last`` − 1; the first batch also checks functions of the state."""
+    layout = on.grid.layout
     # functions of the state are checked once, with the first batch
     amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
     x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)
@@ -202,25 +215,25 @@ def _actions_pass(on: Discretisation, actions: tuple[Array, Array], first: int |
         here, (u, d) = jax.lax.optimization_barrier((x, jax.tree.map(lambda rows: rows[k], tried)))  # see _survey
         bad = _faults(on, here, list(u), list(d)).values()
         # as integers: for booleans XLA would make two passes
-        return amiss | (jnp.max(functools.reduce(jnp.logical_or, bad).astype(jnp.int32)) > 0)
+        return amiss | (jnp.max(layout.cleared(functools.reduce(jnp.logical_or, bad)).astype(jnp.int32)) > 0)
 
-    return ~jax.lax.fori_loop(first, last, look, amiss)
+    return ~layout.some(jax.lax.fori_loop(first, last, look, amiss))
 
 
 def _state_fails(on: Discretisation) -> Verdict:
     """True if ``check_values`` refuses the values of the functions of the state."""
-    problem = on.problem
+    problem, some = on.problem, on.grid.layout.some
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
     if problem.target is not None:
         distance = on.level
         inside = distance <= 0
         # a target that contains no node, or all nodes
-        amiss |= ~jnp.all(jnp.isfinite(distance)) | ~jnp.any(inside) | jnp.all(inside)
+        amiss |= some(~jnp.isfinite(distance)) | ~some(inside) | ~some(~inside)
     for name in (*STATE_COSTS, "killing"):
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            amiss |= jnp.any(relevant & ~jnp.isfinite(on.at_nodes(ingredient)))
+            amiss |= some(relevant & ~jnp.isfinite(on.at_nodes(ingredient)))
     return amiss
 
 
@@ -311,7 +324,7 @@ def _negative(on: Discretisation, rates_at: Callable[..., list], rates: list) ->
     """The nodes where a rate is negative by more than rounding: 0.3 − 0.2 − 0.1 is −3e-17."""
     sets_of = (on.problem.controls, on.problem.disturbances)
     probes = itertools.product(*(sets.probes(each, on.dtype) for each in sets_of))
-    sizes = [jnp.max(jnp.abs(rate)) for u, d in probes for rate in rates_at(u, d)]
+    sizes = [on.grid.layout.largest(jnp.abs(rate)) for u, d in probes for rate in rates_at(u, d)]
     least = -ROUNDING * jnp.finfo(on.dtype).eps * functools.reduce(jnp.maximum, sizes)
     return functools.reduce(jnp.logical_or, (rate < least for rate in rates))
 

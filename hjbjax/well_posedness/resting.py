@@ -45,10 +45,11 @@ def standstill(on: Discretisation) -> Standstill:
 
     With slopes ±s, s_i = max L/max|f_i|, the Hamiltonian is L + Σ s_i |f_i|, which vanishes only at rest.
     """
-    grid, dtype = on.grid, on.dtype
+    grid, dtype, layout = on.grid, on.dtype, on.grid.layout
     least = _least_cost(on)
     speeds, dearest = _scales(on)
-    cost = jnp.max(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))  # infinite if a constrained end admits no action
+    # the least cost is infinite if a constrained end admits no action
+    cost = layout.largest(jnp.where(jnp.isfinite(least), jnp.abs(least), 0))
     # if the least cost is zero everywhere, the most expensive action sets the scale; without any cost the scale is one
     cost = jnp.where(cost > 0, cost, jnp.where(dearest > 0, dearest, 1))
     # an axis without motion imposes no condition
@@ -100,7 +101,7 @@ def _scales(on: Discretisation) -> tuple[jax.Array, jax.Array]:
     pairs = jnp.stack(jnp.meshgrid(jnp.arange(len(us)), jnp.arange(len(ds)), indexing="ij"), -1).reshape(-1, 2)
 
     def largest(entry: Numbers) -> Scalar:
-        return jnp.max(jnp.abs(jnp.broadcast_to(jnp.asarray(entry, dtype), grid.shape)))
+        return grid.layout.largest(jnp.abs(jnp.broadcast_to(jnp.asarray(entry, dtype), grid.shape)))
 
     def look(found: tuple, pair: jax.Array) -> tuple:
         # otherwise XLA hoists terms that do not depend on the pair and keeps an array of all nodes for each

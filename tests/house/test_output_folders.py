@@ -62,7 +62,7 @@ def test_old_pictures_stay_until_all_new_ones_are_there(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["old.png"]
     stopped = False
     pictures.pictures_of_pages(tmp_path, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"README.png", "getting_started.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"README.png", "enclose.png", "getting_started.png"}
 
 
 def test_the_pictures_of_a_card_are_those_of_its_page(tmp_path):

@@ -70,7 +70,7 @@ def test_more_nodes_than_indices_are_refused(door, grid):
 
 @pytest.mark.parametrize("grid", GRIDS, ids=lambda grid: f"{grid.ndim}-D")
 def test_an_estimate_says_that_they_cannot_be_numbered(grid, monkeypatch):
-    monkeypatch.setattr(hjb.solvers.resources.memory, "available", lambda: 10**40)
+    monkeypatch.setattr(hjb.solvers.resources.memory, "available", lambda mesh=None: 10**40)
     found = hjb.estimate(posed(), grid, measure=False)
     assert not found.numbered
     assert not found.fits

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -202,6 +203,21 @@ def test_the_least_of_all_counts(monkeypatch):
     assert memory.available() is None
 
 
+def test_a_mesh_of_accelerators_has_the_memory_of_all_of_them():
+    def card(free):
+        return SimpleNamespace(
+            platform="gpu", memory_stats=lambda: {"bytes_limit": 80 * 10**9, "bytes_in_use": 80 * 10**9 - free}
+        )
+
+    mesh = SimpleNamespace(local_devices=[card(70 * 10**9), card(60 * 10**9)], size=8)  # six of them in other processes
+    assert memory.available(mesh) == 8 * 60 * 10**9
+    needed, grid = 100 * 10**9, square(20_000)
+    assert memory.fitting(needed, grid, None, mesh) == needed
+    mesh.size = 1
+    with pytest.raises(MemoryError, match="60 GB are free"):
+        memory.fitting(needed, grid, None, mesh)
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="limits are POSIX's")
 def test_a_limit_on_the_address_space_refuses_a_grid():
     program = """
@@ -253,7 +269,7 @@ def test_six_dimensions_are_refused_with_a_way_out():
 
 
 def test_nobody_says_what_is_free(monkeypatch):
-    monkeypatch.setattr(memory, "available", lambda: None)
+    monkeypatch.setattr(memory, "available", lambda mesh: None)
     needed = memory.peak_bytes(PROBLEM, square(30_000), METHODS[0], np.float64)
     assert memory.require(PROBLEM, square(30_000), METHODS[0], np.float64, None) == needed
 

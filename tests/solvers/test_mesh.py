@@ -17,7 +17,8 @@ from hjbjax.cli import launch
 SCRIPT = Path(__file__).parents[1] / "support" / "over_devices.py"
 ROOT = Path(__file__).parents[2]
 CHEAP = (
-    "not_a_number_is_not_lost", "compiled_program", "value_iteration", "sweeps", "checkpoints", "faults", "refusals"
+    "not_a_number_is_not_lost", "compiled_program", "value_iteration", "sweeps", "checkpoints", "faults", "refusals",
+    "bytes_per_device",
 )  # fmt: skip
 DEAR = (
     "stencils", "batch", "two_integrators", "march_of_first_order",
@@ -176,6 +177,15 @@ def test_a_batch_over_two_processes():
             said, err = process.communicate(timeout=300)
             assert process.returncode == 0, err
             assert float(said.split()[-1]) <= ULP * 2.3e-16
+
+
+def test_bytes_per_device(found):
+    """Checks, preparation and survey are divided like the steps: an eighth, and the shared numbers."""
+    one, eight = found
+    assert set(one) == set(eight) == {"_actions_pass", "_prepare_jit", "_more_open_jumps"}
+    for name, alone in one.items():
+        assert alone > 9_000  # an array of all nodes, at least
+        assert eight[name] < alone / 6
 
 
 def test_checkpoints(found):

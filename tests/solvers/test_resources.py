@@ -30,7 +30,7 @@ def test_bytes_alone_cost_nothing_whatever_the_size():
 
 
 def test_more_nodes_than_can_be_numbered_do_not_fit(monkeypatch):
-    monkeypatch.setattr(memory, "available", lambda: 10**15)
+    monkeypatch.setattr(memory, "available", lambda mesh=None: 10**15)
     problem, grid = zoo.pendulum(shape=(50_000, 50_001))
     found = hjb.estimate(problem, grid, measure=False)
     assert not found.fits

@@ -4,6 +4,7 @@
 failed. ``tests/solvers/test_mesh.py`` reads it.
 """
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -12,6 +13,7 @@ import tempfile
 import traceback
 import warnings
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +29,7 @@ from hjbjax.problem.layouts import Parts
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solvers import setup, stationary_run
+from hjbjax.well_posedness import attainability, node_checks
 
 RAN, FOUND = {}, {}
 
@@ -452,6 +455,30 @@ def checkpoints():
             other = hjb.solve(PLAIN, ANGLE, mesh=mesh, checkpoint=place, resume=True, **STEPS)
             apart = np.max(np.abs(one.value - other.value)) / np.max(np.abs(one.value))
             found.append({"steps": other.steps, "apart": float(apart), "residuals": len(other.residuals)})
+    return found
+
+
+@case
+def bytes_per_device():
+    """Bytes of a device in each program that passes over the nodes before a solve: one device, then eight."""
+    grid, found = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (96, 95)), []
+    programs = [(node_checks, "_actions_pass"), (setup, "_prepare_jit"), (attainability, "_more_open_jumps")]
+
+    def noted(function, name):
+        def call(*arguments, **options):
+            used = function.lower(*arguments, **options).compile().memory_analysis()
+            parts = used.argument_size_in_bytes + used.output_size_in_bytes + used.temp_size_in_bytes
+            found[-1][name] = max(parts, found[-1].get(name, 0))
+            return function(*arguments, **options)
+
+        return call
+
+    with contextlib.ExitStack() as stack:
+        for module, name in programs:
+            stack.enter_context(mock.patch.object(module, name, noted(getattr(module, name), name)))
+        for mesh in (None, mesh_of(8)):
+            found.append({})
+            hjb.solve(TARGET, grid, mesh=mesh, scheme=hjb.Upwind(), method=hjb.ValueIteration(), tol=1.0)
     return found
 
 

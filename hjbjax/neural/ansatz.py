@@ -1,12 +1,13 @@
 """Values that contain a network and meet the data of a problem exactly, for any weights.
 
     rest point    V(x) = V₂(y) + |y|² N(y)             y = x − x̄, N(0) = 0
-    horizon       V(t, x) = ψ(x) + (1 − t/T) (c + s N(t, x, ψ(x)))
+    horizon       V(t, x) = ψ(x) + V₂(t, y) − V₂(T, y) + (1 − t/T) (c + s N(t, x, ψ(x)))
 
 V₂ = w̄ + p̄·y + ½ y'Py is the linear-quadratic solution at the rest point x̄. The network changes neither the value nor
 the first two derivatives there, and |·|² is the norm of P itself, so the network is a relative correction. Under a
-horizon T the value is the terminal cost ψ at t = T. The terminal cost is also an input of the network, which then needs
-few weights for a value that is similar to a smoother ψ.
+horizon T the value is the terminal cost ψ at t = T, and V₂ is the linear-quadratic solution at the center of the
+states, see ``riccati``. The terminal cost is also an input of the network, which then needs few weights for a value
+that is similar to a smoother ψ.
 """
 
 from typing import Any
@@ -18,7 +19,7 @@ import numpy as np
 from hjbjax.neural.network import Weights, evaluate_network
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
-from hjbjax.problem.types import Number, Scalar, State
+from hjbjax.problem.types import Array, Number, Scalar, State
 
 FLOOR = 0.01  # the least eigenvalue of the norm of the correction relative to the largest, in units of the box
 
@@ -81,6 +82,10 @@ class HorizonAnsatz:
       spread: the spread of ψ.
       scale: s, the size of the difference of V and ψ.
       offset: c.
+      fading: 1 if ψ fades linearly from T to 0, where noise makes V smoother than ψ; 0 if it does not.
+      nodes: the times of the two arrays below, shape (k,); ``None`` without V₂.
+      change: (w, p, P) of V₂ minus their values at T, in one row per node, shape (k, 1 + n + n²).
+      rates: the time derivatives of these rows.
     """
 
     weights: Weights
@@ -91,6 +96,10 @@ class HorizonAnsatz:
     spread: Any
     scale: Any
     offset: Any
+    fading: Any = 0.0
+    nodes: Any = None
+    change: Any = None
+    rates: Any = None
 
     def __call__(self, problem: Problem, t: Number, x: State) -> Scalar:
         """V at one time and state."""
@@ -99,7 +108,21 @@ class HorizonAnsatz:
         inputs = jnp.concatenate(
             [jnp.stack([2 * left - 1, (paid - self.middle) / self.spread]), (x - self.center) / self.size]
         )
-        return paid + left * (self.offset + self.scale * evaluate_network(self.weights, inputs))
+        change = 0.0 if self.nodes is None else self._quadratic_change(jnp.asarray(t, x.dtype), x - self.center)
+        beyond = self.offset + self.scale * evaluate_network(self.weights, inputs) - self.fading * paid
+        return paid + change + left * beyond
+
+    def _quadratic_change(self, t: Array, y: State) -> jax.Array:
+        """V₂(t, y) − V₂(T, y), with cubic polynomials in time between the nodes."""
+        n = y.shape[0]
+        nodes, values, rates = (jnp.asarray(each, y.dtype) for each in (self.nodes, self.change, self.rates))
+        i = jnp.clip(jnp.searchsorted(nodes, t, method="compare_all") - 1, 0, nodes.shape[0] - 2)
+        h = nodes[i + 1] - nodes[i]
+        s = (t - nodes[i]) / h
+        risen, bent = s * s * (3 - 2 * s), s * (1 - s)
+        row = values[i] + risen * (values[i + 1] - values[i])
+        row = row + h * bent * ((1 - s) * rates[i] - s * rates[i + 1])
+        return row[0] + row[1 : 1 + n] @ y + y @ (row[1 + n :].reshape(n, n) @ y) / 2
 
 
 def terminal_cost(problem: Problem, t: Number, x: State) -> jax.Array:

@@ -2,14 +2,15 @@
 
     βV − V_t = min_u [L + f·DV]
 
-The value contains the linear-quadratic solution exactly, see ``ansatz``. The loss has two parts. One is the mean square
-of the residual of the equation at random states, where the minimum over the controls is exact. The other compares V and
-DV with extremals of Pontryagin's principle. They begin at random states, and later where the residual is largest. This
-follows T. Nakamura-Zimmerer, Q. Gong and W. Kang, SIAM J. Sci. Comput. 43 (2021). The residual is relative to the sizes
-of the terms of the equation, so that units do not matter.
+The value contains the linear-quadratic solution exactly, see ``ansatz`` and ``riccati``. The loss has two parts. One is
+the mean square of the residual of the equation at random states, where the minimum over the controls is exact. The
+other compares V and DV with extremals of Pontryagin's principle. They begin at random states, and later where the
+residual is largest. This follows T. Nakamura-Zimmerer, Q. Gong and W. Kang, SIAM J. Sci. Comput. 43 (2021). The
+residual is relative to the sizes of the terms of the equation, so that units do not matter.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,7 +23,7 @@ from hjbjax.extremals.indirect_method import pose
 from hjbjax.feedback.simulation import rollout
 from hjbjax.hamiltonian import pointwise
 from hjbjax.hamiltonian.pointwise import Rule
-from hjbjax.neural import ingredients
+from hjbjax.neural import ingredients, riccati
 from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz, norm_of, terminal_cost
 from hjbjax.neural.extremal_samples import ExtremalSamples
 from hjbjax.neural.network import checked_layers, initial_weights
@@ -30,21 +31,21 @@ from hjbjax.neural.solution import NeuralSolution, value_of, weights_of_guess
 from hjbjax.neural.training import CHUNK, Training, train
 from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import front_door, pytree_dataclass
+from hjbjax.problem.pytree import cast, front_door, pytree_dataclass
 from hjbjax.problem.settings import own_settings
-from hjbjax.problem.types import Key, Number, State
+from hjbjax.problem.types import Array, Key, Number, State
 from hjbjax.solution.clock import CUT, Clock, noting_interrupts
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status
 
 NAME = "neural.solve"
 FLOOR = 0.01  # of the mean size of the terms: below it a residual counts relative to this size
-HELD_OUT, FRESH = 1024, 4096  # states that choose the best weights, and states of the final residual
+HELD_OUT, FRESH = 1024, 4 * 1024  # states that choose the best weights, and states of the final residual
 CANDIDATES = 64  # random states per extremal; the one with the largest residual is its start
 ROUNDS = 4  # in which the extremals are computed, half of them before the training
 WARM = 0.25  # of the steps, over which the weight of the residual grows from zero to one
 POINTS = 128  # of extremals in a batch
-ENOUGH = 1e-8  # relative residual of a value that needs no training, such as the linear-quadratic one
+ENOUGH = 1e-6  # relative residual of a value that needs no training, such as the linear-quadratic one
 BIAS = 0.5  # of a network that has to learn the quadratic part
 
 
@@ -68,8 +69,8 @@ class Equation:
     floor: Any
     rule: Rule
 
-    def terms(self, ansatz: Callable, t: Number, x: State) -> tuple[jax.Array, jax.Array]:
-        """The residual V_t + min_u [L + f·DV] − βV, and the size of its terms, in cost per unit time."""
+    def terms(self, ansatz: Callable, t: Number, x: State) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The residual V_t + min_u [L + f·DV] − βV and the size of its terms, in cost per unit time, and V."""
         problem = self.problem
         value, (rate, p) = jax.value_and_grad(ansatz, (1, 2))(problem, t, x)
         # the control minimises H, so its own derivative contributes nothing
@@ -77,13 +78,14 @@ class Equation:
         paid = pointwise.running_cost(problem, t, x, u)
         moved = jnp.asarray(problem.drift(*problem.arguments(x, u, t=t)), p.dtype) @ p
         parts = jnp.stack([rate, paid, moved, -problem.discount * value])
-        return jnp.sum(parts), jax.lax.stop_gradient(jnp.sum(jnp.abs(parts)) / 2)
+        return jnp.sum(parts), jax.lax.stop_gradient(jnp.sum(jnp.abs(parts)) / 2), value
 
     def relative_residual(self, ansatz: Callable, t: Number, x: State) -> jax.Array:
         """The residual relative to its terms."""
-        residual, size = self.terms(ansatz, t, x)
+        residual, size, _ = self.terms(ansatz, t, x)
         return residual / (size + self.floor)
 
+    @functools.partial(jax.jit, static_argnums=2)
     def places(self, key: Key, count: int) -> tuple[jax.Array, jax.Array]:
         """Random times (count,) and states (count, n)."""
         of_time, of_state = jax.random.split(key)
@@ -126,7 +128,8 @@ def solve(
       horizon: T, in units of time; the value then depends on (t, x) and is the terminal cost at T. ``None``: infinite.
       rest: a state near the rest point of an infinite horizon. ``None``: the origin.
       quadratic: False leaves the linear-quadratic solution out of the value, for comparison. With few extremals the
-        training may then end at another solution of the equation, such as a negative one.
+        training may then end at another solution of the equation, such as a negative one. Over a horizon this solution
+        belongs to the middle of the box, and is left out if its Riccati equation has none.
       extremals: number of extremals for the training; 0 trains on the residual of the equation only.
       held_out: number of further extremals for the validation.
       steps: steps of the optimiser.
@@ -168,7 +171,7 @@ def solve(
             options: dict[str, Any] = {"rest": ansatz.state}
         else:
             duration = float(arguments.positive(horizon, f"{NAME}: horizon", "in units of time"))
-            equation, ansatz = _over_horizon(equation, duration, initial_weights(seed, n + 2, widths))
+            equation, ansatz = _over_horizon(equation, duration, quadratic, initial_weights(seed, n + 2, widths))
             options = {"horizon": duration}
         if guess is not None:
             begun = weights_of_guess(guess, np.shape(ansatz.weights[0][0])[0], widths, NAME)
@@ -201,27 +204,50 @@ def _at_rest(equation: Equation, near: Any, quadratic: bool, weights: Any) -> tu
     ansatz = RestAnsatz(
         weights, state, np.asarray(rest.costate), np.asarray(rest.value), matrix, norm_of(matrix, size), size
     )
-    equation = dataclasses.replace(equation, floor=FLOOR * _mean_size(equation, ansatz))
+    _, sizes, _ = _terms_at(equation, ansatz, equation.places(jax.random.key(0), HELD_OUT))
+    equation = dataclasses.replace(equation, floor=FLOOR * np.mean(sizes))
     return equation, ansatz if quadratic else dataclasses.replace(ansatz, matrix=0 * matrix, quadratic=False)
 
 
-def _over_horizon(equation: Equation, horizon: float, weights: Any) -> tuple[Equation, HorizonAnsatz]:
-    """The equation with its horizon and floor, and the terminal cost with a network."""
+def _over_horizon(equation: Equation, horizon: float, quadratic: bool, weights: Any) -> tuple[Equation, HorizonAnsatz]:
+    """The equation with its horizon and floor, and terminal cost and linear-quadratic solution with a network."""
     equation = dataclasses.replace(equation, horizon=horizon)
     lo, hi = np.asarray(equation.lo), np.asarray(equation.hi)
-    states = equation.places(jax.random.key(0), HELD_OUT)[1]
-    paid = np.asarray(jax.vmap(lambda x: terminal_cost(equation.problem, horizon, x))(states))
+    places = equation.places(jax.random.key(0), HELD_OUT)
+    paid = np.asarray(jax.jit(jax.vmap(lambda x: terminal_cost(equation.problem, horizon, x)))(places[1]))
     spread = float(np.std(paid)) or 1.0
     ansatz = HorizonAnsatz(weights, horizon, (lo + hi) / 2, (hi - lo) / 2, float(np.mean(paid)), spread, spread, 0.0)
-    size = _mean_size(equation, ansatz)
-    equation = dataclasses.replace(equation, floor=FLOOR * size)
-    return equation, dataclasses.replace(ansatz, scale=horizon * float(size) or spread)
+    found = riccati.coefficients(equation.problem, equation.rule, ansatz.center, horizon) if quadratic else None
+    if found is not None:
+        ansatz = dataclasses.replace(ansatz, **found._asdict())
+    residuals, sizes, _ = _terms_at(equation, ansatz, places)
+    equation = dataclasses.replace(equation, floor=FLOOR * np.mean(sizes))
+    # the residual adds up along a path to the difference of V and the linear-quadratic solution
+    rate = float(np.mean(sizes if found is None else np.abs(residuals)))
+    return equation, dataclasses.replace(ansatz, scale=horizon * rate or spread)
 
 
-def _mean_size(equation: Equation, ansatz: Any) -> jax.Array:
-    """The mean size of the terms of the equation for a value without a network."""
-    places = equation.places(jax.random.key(0), HELD_OUT)
-    return jnp.mean(jax.jit(jax.vmap(lambda t, x: equation.terms(ansatz, t, x)[1]))(*places))
+@jax.jit
+def _terms(equation: Equation, ansatz: Any, t: Array, x: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """``Equation.terms`` at times (k,) and states (k, n)."""
+    return jax.vmap(lambda t, x: equation.terms(ansatz, t, x))(t, x)
+
+
+def _terms_at(equation: Equation, ansatz: Any, places: tuple[Array, Array]) -> list[np.ndarray]:
+    """``Equation.terms`` at some places, in blocks of the same size, so that one program serves all."""
+    t, x = (np.asarray(each) for each in places)
+    equation, ansatz = cast((equation, ansatz), np.float64)
+    blocks = []
+    for first in range(0, len(t), HELD_OUT):
+        rows = np.resize(np.arange(first, min(first + HELD_OUT, len(t))), HELD_OUT)
+        blocks.append([np.asarray(each) for each in _terms(equation, ansatz, t[rows], x[rows])])
+    return [np.concatenate(parts)[: len(t)] for parts in zip(*blocks, strict=True)]
+
+
+def _relative_residuals(equation: Equation, ansatz: Any, places: tuple[Array, Array]) -> np.ndarray:
+    """The residuals relative to their terms, shape (k,)."""
+    residuals, sizes, _ = _terms_at(equation, ansatz, places)
+    return residuals / (sizes + float(equation.floor))
 
 
 def _trained(
@@ -237,16 +263,13 @@ def _trained(
     steps, batch = counts
     size = (equation.hi - equation.lo) / 2
     pure = isinstance(ansatz, RestAnsatz) and not ansatz.quadratic
-    values = jax.vmap(lambda t, x: ansatz(equation.problem, t, x))(*equation.places(jax.random.key(0), HELD_OUT))
+    _, _, values = _terms_at(equation, ansatz, equation.places(jax.random.key(0), HELD_OUT))
     # without its quadratic part the initial value may be zero everywhere; the mean of |y|² is as large as the exact one
-    typical = jnp.sum(jnp.diagonal(ansatz.norm) * ansatz.size**2) / 3 if pure else jnp.mean(jnp.abs(values))
-    least = jnp.maximum(FLOOR * typical, jnp.finfo(float).tiny)
+    typical = np.sum(np.diagonal(ansatz.norm) * ansatz.size**2) / 3 if pure else np.mean(np.abs(values))
+    least = max(FLOOR * typical, np.finfo(float).tiny)
 
     def of(weights: Any) -> Any:
         return dataclasses.replace(ansatz, weights=weights)
-
-    def squares(weights: Any, places: Any) -> jax.Array:
-        return jax.vmap(lambda t, x: equation.relative_residual(of(weights), t, x))(*places) ** 2
 
     def misfit(weights: Any, t: Any, x: Any, value: Any, costate: Any) -> jax.Array:
         found, p = jax.value_and_grad(of(weights), 2)(equation.problem, t, x)
@@ -258,12 +281,15 @@ def _trained(
         rows = jax.random.randint(of_points, (POINTS,), 0, data["count"])
         points = (data[name][rows] for name in ("times", "states", "values", "costates"))
         apart = jax.vmap(lambda *point: misfit(weights, *point))(*points)
-        residual = jnp.mean(squares(weights, equation.places(of_states, batch)))
-        return data["share"] * residual + data["weight"] * jnp.mean(apart)
+        places = equation.places(of_states, batch)
+        residuals = jax.vmap(lambda t, x: equation.relative_residual(of(weights), t, x))(*places)
+        return data["share"] * jnp.mean(residuals**2) + data["weight"] * jnp.mean(apart)
 
     held_out = equation.places(jax.random.key(seed + 1), HELD_OUT)
-    measure = jax.jit(lambda weights: jnp.sqrt(jnp.mean(squares(weights, held_out))))
-    residuals = jax.jit(squares)
+
+    def measure(weights: Any) -> float:
+        return float(np.sqrt(np.mean(_relative_residuals(equation, of(weights), held_out) ** 2)))
+
     chunks = -(-steps // CHUNK)
     rounds = {chunks * k // ROUNDS: -(-seen.capacity // (2 * (ROUNDS - 1))) for k in range(1, ROUNDS)}
     rounds[0] = seen.capacity // 2 + seen.capacity % 2
@@ -274,7 +300,7 @@ def _trained(
         if (share := rounds.get(number, 0)) and len(seen.starts) < seen.capacity:
             places = equation.places(jax.random.key(seed + 2 + number), CANDIDATES * share)
             # at the start of a pure network the residual only measures the distance to the rest point
-            large = np.zeros((share, CANDIDATES)) if pure else np.asarray(residuals(weights, places))
+            large = np.zeros(share * CANDIDATES) if pure else np.abs(_relative_residuals(equation, of(weights), places))
             worst = np.argmax(large.reshape(share, CANDIDATES), axis=1)
             starts = np.asarray(places[1]).reshape(share, CANDIDATES, -1)[np.arange(share), worst]
             seen.collect(equation.problem, starts, clock)
@@ -293,12 +319,7 @@ def _trained(
 def _validation(equation: Equation, solution: NeuralSolution, unseen: ExtremalSamples, seed: int) -> dict[str, float]:
     """Errors at states and along extremals that training has not seen."""
     places = equation.places(jax.random.key(seed + 1_000_000), FRESH)
-
-    @jax.jit
-    def residuals(solution: NeuralSolution) -> jax.Array:
-        return jax.vmap(lambda t, x: equation.relative_residual(solution.ansatz, t, x))(*places)
-
-    found = {"residual": float(jnp.sqrt(jnp.mean(residuals(solution) ** 2)))}
+    found = {"residual": float(np.sqrt(np.mean(_relative_residuals(equation, solution.ansatz, places) ** 2)))}
     if not unseen.starts:
         return found
     rows, size = slice(0, unseen.count), np.asarray(equation.hi - equation.lo)

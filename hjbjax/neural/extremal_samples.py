@@ -14,6 +14,7 @@ from hjbjax.solution.clock import Clock
 from hjbjax.solution.solution import SolveError
 
 POINTS = 32  # per extremal, at equal distances along it in units of the box
+TOL = 1e-5  # of an extremal: its cost is exact to about 1e-8, and it takes a sixth of the time of one with 1e-8
 
 
 @dataclasses.dataclass
@@ -53,7 +54,7 @@ class ExtremalSamples:
             if clock.over() is not None or len(self.starts) == self.capacity:
                 return
             try:
-                extremal = pontryagin(problem, np.asarray(start), **self.options)
+                extremal = pontryagin(problem, np.asarray(start), tol=TOL, **self.options)
             except (SolveError, ValueError):
                 self.failed += 1
                 continue

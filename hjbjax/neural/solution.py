@@ -167,7 +167,11 @@ class NeuralSolution(files.Saved):
         return found if problem is None else with_problem(found, problem)
 
     def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        fields = {name: each for name, each in vars(self.ansatz).items() if name not in ("weights", "quadratic")}
+        fields = {
+            name: each
+            for name, each in vars(self.ansatz).items()
+            if name not in ("weights", "quadratic") and each is not None
+        }
         arrays = {name: np.asarray(each, float) for name, each in fields.items()}
         for i, (matrix, bias) in enumerate(self.ansatz.weights):
             arrays |= {f"matrix{i}": np.asarray(matrix, float), f"bias{i}": np.asarray(bias, float)}

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
 import hjbjax as hjb
@@ -36,6 +37,29 @@ def test_a_linear_quadratic_value_is_exact(quadratic):
     assert np.allclose(quadratic.costate_at(STATES), 2 * STATES @ RICCATI, rtol=1e-9)
     assert np.allclose(quadratic.control_at(STATES), -STATES @ RICCATI @ B, rtol=1e-9)
     assert quadratic.validation["residual"] < 1e-9
+
+
+def test_a_linear_quadratic_value_over_a_horizon_is_exact():
+    """V = x'Px + s·x + w with −P' = 1 + A'P + PA − PBB'P − βP, and a constant push in the drift."""
+    end, push = np.diag([2.0, 0.5, 1.0]), np.array([0.3, 0.0, -0.2])
+    problem = hjb.Problem(
+        lambda x, u: PLANT.drift(x, u) + push, PLANT.cost, PLANT.controls, discount=0.2,
+        terminal_cost=lambda x: x @ jnp.asarray(end) @ x - x[0],
+    )  # fmt: skip
+    found = neural.solve(problem, *CORNERS, seed=0, horizon=2.0, **CHEAP)
+
+    def backward(left, row):
+        p, s, w = row[:9].reshape(3, 3), row[9:12], row[12]
+        change = np.eye(3) + A.T @ p + p @ A - p @ B @ B.T @ p - 0.2 * p
+        slope = (A.T - p @ B @ B.T) @ s + 2 * p @ push - 0.2 * s
+        return np.r_[change.ravel(), slope, s @ push - s @ B @ B.T @ s / 4 - 0.2 * w]
+
+    start = np.r_[end.ravel(), [-1.0, 0.0, 0.0], 0.0]
+    for t in (0.0, 1.3):
+        row = solve_ivp(backward, (0, 2.0 - t), start, rtol=1e-10, atol=1e-12).y[:, -1]
+        exact = np.einsum("ki,ij,kj->k", STATES, row[:9].reshape(3, 3), STATES) + STATES @ row[9:12] + row[12]
+        assert np.allclose(found.value_at(t, STATES), exact, rtol=0, atol=1e-6 * np.max(np.abs(exact)))
+    assert found.status is hjb.Status.CONVERGED
 
 
 def test_it_is_a_feedback(quadratic):
@@ -89,6 +113,10 @@ def test_a_stochastic_value_in_closed_form(diffusion, tmp_path):
     assert abs(found["value"] - exact) < 3 * found["standard_error"] + 2 * found["time_error"] + 0.01
     assert found["unexplained"] < 0.1
     assert abs(diffusion.value_at(0.0, START) - found["value"]) < 1e-9
+    near = START + 0.1 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    off = diffusion.value_at(0.0, near) - np.sum(near**2, axis=1) / 2 - 0.25 * 2 * np.log(2)
+    assert np.max(np.abs(off)) < 0.03
+    assert abs(np.mean(off)) < found["near_error"] + 0.01
     x = np.array([0.3, -0.2])
     assert abs(diffusion.value_at(1.0, x) - x @ x) < 1e-12
     assert np.allclose(diffusion.control_at(0.5, x), -x / 1.5, atol=0.15)
@@ -179,6 +207,11 @@ def test_a_hundred_states():
     found = neural.deep_bsde(problem, np.zeros(100), 1.0, seed=0)
     assert found.status is hjb.Status.CONVERGED
     assert abs(found.validation["value"] / 4.59016 - 1) < 0.005
+    # e^{−V} solves a linear equation, so V is the logarithm of a mean over normal numbers, also at other states
+    draw = np.random.default_rng(0)
+    ends, near = np.sqrt(2.0) * draw.normal(size=(40000, 100)), draw.normal(size=(8, 100)) / 10
+    exact = [-np.log(np.mean(2 / (1 + np.sum((x + ends) ** 2, axis=1)))) for x in near]
+    assert np.max(np.abs(found.value_at(0.0, near) / exact - 1)) < 0.01
 
 
 def relative(error, exact):

@@ -263,6 +263,36 @@ def test_a_manufactured_value_in_six_states():
 
 @pytest.mark.slow
 @pytest.mark.optimised
+def test_a_manufactured_value_over_a_horizon():
+    """In four states, with the cost q(t, x) + |u|², x' = f(x) + u and q = −V_t − f·DV + ¼ |DV|²."""
+    matrix, horizon = np.random.default_rng(3).normal(size=(4, 4)) / 2, 1.5
+
+    def value(t, x):
+        swelling = (1 + 0.5 * jnp.cos(2 * t)) * jnp.sum(jnp.log(1 + x**2))
+        return swelling + 0.5 * x @ x + 0.3 * (1 - jnp.cos(x @ jnp.asarray(matrix) @ x + t))
+
+    def free(x):
+        return -x + 0.5 * jnp.roll(x, 1) * jnp.cos(x)
+
+    def paid(t, x):
+        rate, slope = jax.grad(value, (0, 1))(t, x)
+        return 0.25 * slope @ slope - free(x) @ slope - rate
+
+    problem = hjb.Problem(
+        lambda t, x, u: free(x) + u, lambda t, x, u: paid(t, x) + u @ u, hjb.Box([-50.0] * 4, [50.0] * 4),
+        terminal_cost=lambda t, x: value(horizon, x), time_dependent=True,
+    )  # fmt: skip
+    options = {"seed": 0, "horizon": horizon, "steps": 2500, "extremals": 8, "held_out": 0}
+    found = neural.solve(problem, [-1.0] * 4, [1.0] * 4, **options)
+    draw = np.random.default_rng(1)
+    times, states = draw.uniform(0, horizon, 2000), draw.uniform(-1, 1, (2000, 4))
+    exact = np.asarray(jax.vmap(value)(times, states))
+    assert relative(found.value_at(times, states) - exact, exact) < 0.02
+    assert np.allclose(found.value_at(horizon, states), jax.vmap(value, (None, 0))(horizon, states), rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
 def test_a_satellite_turns_as_cheaply_as_its_extremals():
     """Attitude by Rodrigues parameters and rates; 100 held-out states."""
     inertia = np.array([[4.0, 0.2, 0.1], [0.2, 3.0, 0.3], [0.1, 0.3, 2.0]])

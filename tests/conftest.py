@@ -70,15 +70,15 @@ def pytest_configure(config):
 
 def pytest_addoption(parser):
     """The long tests take an hour or more on a slow machine, so each run of CI takes a share of them."""
-    parser.addoption("--share", metavar="K/N", default="1/1", help="run the tests of every N-th file from the K-th on")
+    parser.addoption("--share", metavar="K/N", default="1/1", help="run every N-th test function from the K-th on")
 
 
-@pytest.hookimpl(trylast=True)  # after `-m` and `-k`, so that all files counted have tests to run
+@pytest.hookimpl(trylast=True)  # after `-m` and `-k`, so that only tests that would run are counted
 def pytest_collection_modifyitems(config, items):
-    """Leave out the files that belong to another share."""
-    chosen = shares.select({item.path for item in items}, config.getoption("--share"))
-    config.hook.pytest_deselected(items=[item for item in items if item.path not in chosen])
-    items[:] = [item for item in items if item.path in chosen]
+    """Leave out the tests that belong to another share."""
+    chosen = shares.select({item.nodeid for item in items}, config.getoption("--share"))
+    config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in chosen])
+    items[:] = [item for item in items if item.nodeid in chosen]
 
 
 def pytest_runtest_setup(item):

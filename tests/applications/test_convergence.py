@@ -111,6 +111,7 @@ def test_a_finer_solution_as_the_reference(plain):
     assert "linear between its nodes" in hjb.convergence_study(PROBLEM, line(21, 31), fine).reference
 
 
+@pytest.mark.slow
 def test_without_a_reference_richardson_comes_close_to_the_truth(plain):
     study = hjb.convergence_study(PROBLEM, line(21, 41, 81))
     assert study.estimated

@@ -187,6 +187,7 @@ def level_up_to(b):
     return 1 / np.sqrt(1 + (1 - b**2) ** 2)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the box decides V")
 def test_a_plateau_near_the_rest_point_is_not_settled():
     """At γ = 0.87 V(0.08) stays at 0.0018 up to T = 8 and is 12.4 at T = 128."""
@@ -263,6 +264,7 @@ def test_a_bound_that_is_felt_is_infeasible():
     assert len(str(e.value).splitlines()) <= 6
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_a_march_goes_on_from_another():
     problem, grid = LAG.game()(0.9), cube(1, 21)

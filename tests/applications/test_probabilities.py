@@ -104,6 +104,7 @@ def beyond(place, sign, x):
 BETWEEN = st.floats(0.05, 0.95)  # of a cell: a link shorter than .01 is made longer
 
 
+@pytest.mark.slow
 @given(st.integers(1, 3), BETWEEN, st.integers(6, 8), BETWEEN)
 @settings(max_examples=15)
 def test_without_drift_the_chance_is_linear_also_between_the_nodes(k, low, m, high):
@@ -210,6 +211,7 @@ def test_the_reflection_principle():
     assert order_of(errors) == pytest.approx(2, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 def test_a_target_that_runs_along_with_the_drift():
     """In the frame of dx = dt + dw the target x ≤ t stands still; only the first-order upwind slopes tell."""
@@ -364,7 +366,8 @@ def calm_in_the_middle(x, u):
 
 
 @pytest.mark.parametrize(
-    ("options", "atol"), [({}, 1e-5), ({"tol": 1e-2}, 1e-5), ({"dtype": "float32", "tol": 1e-2}, 1e-3)]
+    ("options", "atol"),
+    [({}, 1e-5), ({"tol": 1e-2}, 1e-5), pytest.param({"dtype": "float32", "tol": 1e-2}, 1e-3, marks=pytest.mark.slow)],
 )
 def test_who_may_stay_for_ever_need_not_arrive(options, atol):
     """Noise only beyond the nodes ±¼: what is inside stays; from outside one comes to rest there, or to ±1."""
@@ -375,6 +378,7 @@ def test_who_may_stay_for_ever_need_not_arrive(options, atol):
     assert found.reached is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("least", [False, True])
 def test_without_noise_the_answer_is_yes_or_no(least):
     """ẋ = u, |u| ≤ 1: who wants to gets there, who does not stays where he is."""

@@ -42,6 +42,7 @@ def test_a_floating_boat_has_its_light_cone():
     assert tube.value.min() >= -1.1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_the_stationary_tube_is_the_limit_of_marching():
     grid = hjb.Grid([-3.0, -3.0], [3.0, 3.0], (31, 31))
@@ -60,7 +61,7 @@ def push(x, u, d):
     return u + 0.5 * d
 
 
-@pytest.mark.parametrize("player", ["with", "without"])
+@pytest.mark.parametrize("player", ["with", pytest.param("without", marks=pytest.mark.slow)])
 def test_an_opponent_slows_the_tube_down(player):
     """|x| ≤ ½ + (1 − ½)T against a disturbance of half the strength, ½ + T without one."""
     grid = hjb.Grid([-4.0], [4.0], (161,))

@@ -202,7 +202,7 @@ def assert_at_most_so_much_below(value, known, spacing_error):
 
 
 @pytest.mark.parametrize("grid", [LINE, GATHERED], ids=["uniform", "stretched"])
-@pytest.mark.parametrize("sigma", [0.0, 0.3])
+@pytest.mark.parametrize("sigma", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 @pytest.mark.filterwarnings("error", "ignore:the box decides V")
 def test_one_input_against_the_oracle(grid, sigma):
     for seed in range(3):
@@ -398,7 +398,7 @@ def dearer(rate, x, u):
     return rate * slope_and_effort(x, u)
 
 
-@pytest.mark.parametrize("edges", ["constrained", "open"])
+@pytest.mark.parametrize("edges", ["constrained", pytest.param("open", marks=pytest.mark.slow)])
 def test_units_change_nothing_else(edges):
     """Time times 1e6 and cost times 1e9: V is scaled, and neither a status nor a policy knows."""
     grid = hjb.Grid([-1.0], [1.2], (21,), edges=edges)
@@ -500,7 +500,7 @@ def between_walls(x, u):
     return jnp.stack([u[0] - 0.37, 0.37 - u[0]])
 
 
-@pytest.mark.parametrize("power", [2, 4])
+@pytest.mark.parametrize("power", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_a_corner_may_leave_one_action_alone(power):
     """Of two ends each forbids one side of u = .37, and no sample is .37; a cost in u⁴ is sampled."""
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (5, 5), edges="constrained")
@@ -569,11 +569,11 @@ def carried(x, u):
 @pytest.mark.parametrize(
     ("scheme", "method", "most"),
     [
-        (hjb.Upwind(), hjb.Explicit(), 2e-2),
-        (hjb.Upwind(), hjb.Implicit(), 2e-2),
+        pytest.param(hjb.Upwind(), hjb.Explicit(), 2e-2, marks=pytest.mark.slow),
+        pytest.param(hjb.Upwind(), hjb.Implicit(), 2e-2, marks=pytest.mark.slow),
         (hjb.Limited(), hjb.Explicit(), 3e-4),
-        (hjb.Eno2(), hjb.Explicit(), 4e-4),
-        (hjb.Weno5(), hjb.Explicit(), 6e-5),
+        pytest.param(hjb.Eno2(), hjb.Explicit(), 4e-4, marks=pytest.mark.slow),
+        pytest.param(hjb.Weno5(), hjb.Explicit(), 6e-5, marks=pytest.mark.slow),
     ],
     ids=["upwind", "implicit", "limited", "eno2", "weno5"],
 )
@@ -684,7 +684,7 @@ def test_where_nobody_earns_by_it_nothing_is_cut():
     assert not hjb.solve(problem, hjb.Grid([-1.0], [1.2], (21,)), scheme=hjb.Upwind()).cut.any()
 
 
-@pytest.mark.parametrize("dtype", [None, "float32"])
+@pytest.mark.parametrize("dtype", [None, pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("bound", "current"), [(1.0, 0.0), (1.0, -2e5), (1e6, 0.0)])
 def test_what_leaves_is_told_by_the_drift_there(bound, current, dtype):
     """Neither a fast current at the other end nor fast actions make a step across the end rounding."""

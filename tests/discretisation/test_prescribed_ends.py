@@ -26,7 +26,10 @@ def ends(kind, scale, at):
     return {"dirichlet": hjb.Dirichlet(value), "neumann": hjb.Neumann(value), "robin": hjb.Robin(1.0)}[kind]
 
 
-@pytest.mark.parametrize("kind", ["dirichlet", "neumann", "robin"])
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param("dirichlet", marks=pytest.mark.slow), pytest.param("neumann", marks=pytest.mark.slow), "robin"],
+)
 @pytest.mark.parametrize("drift", [-0.1, 0.1])
 def test_exponential_value_with_noise(kind, drift):
     """The exact solution is met with second order, on both sides, by the default scheme."""
@@ -42,7 +45,10 @@ def test_exponential_value_with_noise(kind, drift):
     assert errors[-1] < 2e-3 * scale
 
 
-@pytest.mark.parametrize("kind", ["dirichlet", "neumann", pytest.param("robin", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind",
+    ["dirichlet", pytest.param("neumann", marks=pytest.mark.slow), pytest.param("robin", marks=pytest.mark.slow)],
+)
 def test_transport_out_of_the_box(kind):
     """Without noise the drift carries the state out at the upper end; what is prescribed there decides V."""
     problem, exact, scale = exponential(0.3, 0.0, 0.5)
@@ -98,7 +104,15 @@ def test_functions_of_the_state_in_the_plane():
     assert errors[-1] < 2e-3
 
 
-@pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Limited(), hjb.Eno2(), hjb.Weno5()])
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        hjb.Upwind(),
+        pytest.param(hjb.Limited(), marks=pytest.mark.slow),
+        pytest.param(hjb.Eno2(), marks=pytest.mark.slow),
+        hjb.Weno5(),
+    ],
+)
 def test_marches(scheme):
     """V(t, x) = exp(x + c (T − t)) solves the heat equation with drift; every scheme keeps it at every kind of end."""
     drift, noise, horizon = 0.1, 0.5, 0.5

@@ -152,8 +152,20 @@ def held_back(noise=None, controls=None):
 
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves the box")
-@pytest.mark.parametrize("noise", [None, 0.5])
-@pytest.mark.parametrize("method", [None, hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct())])
+@pytest.mark.parametrize(
+    ("method", "noise"),
+    [
+        (None, 0.5),
+        (hjb.ValueIteration(), None),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in [
+                (None, None), (hjb.ValueIteration(), 0.5),
+                (hjb.PolicyIteration(hjb.Direct()), None), (hjb.PolicyIteration(hjb.Direct()), 0.5),
+            ]
+        ),
+    ],
+)  # fmt: skip
 def test_a_chain_of_ones_own_is_solved_and_certified(method, noise):
     scheme, grid = LaxFriedrichs(1.2), hjb.Grid([-1.0], [1.0], (21,))
     solution = hjb.solve(held_back(noise), grid, scheme=scheme, method=method, tol=1e-8)
@@ -166,7 +178,7 @@ def test_a_chain_of_ones_own_is_solved_and_certified(method, noise):
 
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves the box", "ignore:the grid is coarse")
-@pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit(hjb.Direct())])
+@pytest.mark.parametrize("method", [hjb.Explicit(), pytest.param(hjb.Implicit(hjb.Direct()), marks=pytest.mark.slow)])
 def test_it_marches_to_its_stationary_value(method):
     grid, scheme = hjb.Grid([-1.0], [1.0], (21,)), LaxFriedrichs(1.2)
     found = hjb.march(held_back(0.5), grid, 30.0, scheme=scheme, method=method).value[0]
@@ -228,6 +240,7 @@ def test_a_chain_with_too_little_diffusion_is_refused(ask):
     ask(LaxFriedrichs(2.0))
 
 
+@pytest.mark.slow
 def test_a_chain_that_leaves_out_noise_is_refused():
     noisy = dataclasses.replace(FAST, noise=0.5)
     with pytest.raises(ValueError, match="too little diffusion"):

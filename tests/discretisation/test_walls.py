@@ -94,6 +94,7 @@ def test_the_exit_time_of_a_reflected_brownian_motion():
     np.testing.assert_allclose(found.value, (1 - np.asarray(grid.axis(0)) ** 2) / SIGMA**2, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_target_inside_the_last_cell():
     """From a wall at 1 to the boundary at 1 − d, which cuts its only link: d²/σ²."""
     grid = hjb.Grid([0.0], [1.0], (11,))
@@ -156,7 +157,8 @@ def test_diagonal_jumps_reflect_to_second_order(correlation, scheme):
 SLOWLY = [pytest.param(scheme, marks=pytest.mark.slow) for scheme in (hjb.Limited(), hjb.Eno2())]
 
 
-@pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Weno5(), *SLOWLY])
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", [pytest.param(hjb.Upwind(), marks=pytest.mark.slow), hjb.Weno5(), *SLOWLY])
 def test_heat_between_two_walls(scheme):
     """−V_t = ½σ²V″: cos πx decays at the rate π²σ²/2."""
     errors = []

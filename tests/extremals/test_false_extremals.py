@@ -93,7 +93,7 @@ def test_a_final_time_may_be_the_worst(guess, end, status):
         (1, 3.0, [0.0], None),
         (1, 1.7, None, 1.7 - np.pi / 2),
         (1, 1.5, None, None),
-        (2, 4.0, [0.0, 0.0], 4.0 - np.pi),
+        pytest.param(2, 4.0, [0.0, 0.0], 4.0 - np.pi, marks=pytest.mark.slow),
     ],
 )
 def test_past_a_conjugate_point(dim, horizon, ends, conjugate):
@@ -135,6 +135,7 @@ def test_a_start_at_rest():
     assert hjb.pontryagin(problem, [0.0, 0.0]).cost == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [pytest.param(1e-9, marks=pytest.mark.slow), 1e6])
 def test_lengths_in_any_unit(unit):
     """tanh(T) x², and least time 2 √(x/a): a length of 1e-9 is below every absolute tolerance."""

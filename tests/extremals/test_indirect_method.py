@@ -120,6 +120,7 @@ def test_what_depends_on_time():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.5, -0.3])
 def test_a_target_that_moves(speed):
     """To x ≥ 1 + ct at 1 + u²: in 1/(u − c), at the cost (1 + u²)/(u − c), which is least for u = c + √(c² + 1)."""
@@ -154,6 +155,7 @@ def test_least_time_of_the_double_integrator(start, discount):
     np.testing.assert_array_equal(np.abs(extremal.controls), 1)
 
 
+@pytest.mark.slow
 def test_from_the_switching_curve_there_is_no_switch():
     problem = without_target(zoo.double_integrator(discount=0.0)[0])
     extremal = hjb.pontryagin(problem, [-0.5, 1.0], terminal=[0.0, 0.0])
@@ -397,7 +399,9 @@ def test_no_sample_beats_the_minimiser(admissible, functions, exactly):
                 assert np.all((u >= SETS["box"].lo) & (u <= SETS["box"].hi))
 
 
-@pytest.mark.parametrize("functions", [QUADRATIC, COUPLED], ids=["exact", "searched"])
+@pytest.mark.parametrize(
+    "functions", [QUADRATIC, pytest.param(COUPLED, marks=pytest.mark.slow)], ids=["exact", "searched"]
+)
 def test_the_minimiser_is_differentiable(functions):
     """So that Newton's method in the collocation has its true slopes."""
     problem = hjb.Problem(*functions, hjb.Ball(2.0, 2))

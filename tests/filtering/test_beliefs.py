@@ -95,7 +95,10 @@ def both_generators(question, h, noise, belief, u, weights):
     return ours, theirs, problem.cost(x, u), belief @ chain.running(u), coordinates.to_belief(x)
 
 
-@pytest.mark.parametrize(("states", "sensors"), [(2, 2), (3, 1), (4, 2)])
+@pytest.mark.parametrize(
+    ("states", "sensors"),
+    [pytest.param(2, 2, marks=pytest.mark.slow), (3, 1), pytest.param(4, 2, marks=pytest.mark.slow)],
+)
 @given(seed=SEEDS)
 @settings(max_examples=15)
 def test_itos_formula_on_the_simplex(states, sensors, seed):
@@ -133,6 +136,7 @@ def machine_values():
     return {r: solved(posed(machine(), [1.0, 0.0], measurement_noise=r, nodes=401)).value for r in (0.01, 0.1, 1, 100)}
 
 
+@pytest.mark.slow
 def test_the_better_it_sees_the_less_it_pays_and_between_full_and_no_observation():
     values = machine_values()
     pi = np.linspace(0, 1, 401)
@@ -166,6 +170,7 @@ def test_the_value_is_concave_and_of_second_order_in_the_nodes():
     assert -np.polyfit(range(3), np.log2(errors), 1)[0] >= 1.5
 
 
+@pytest.mark.slow
 @given(seed=SEEDS)
 @settings(max_examples=8)
 def test_random_chains_lie_between_full_and_no_observation(seed):

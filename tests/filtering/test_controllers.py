@@ -99,6 +99,7 @@ def _pushed(push, x, u):
     return push * u - x
 
 
+@pytest.mark.slow
 def test_noise_that_depends_on_the_control_brings_the_second_derivative():
     # H = ½ρu² + u P x + ½ (s u)² P: u = −P m/(ρ + s² P)
     strength, mean = 0.8, 1.2
@@ -122,7 +123,9 @@ COSTS = {  # of one state in NumPy's functions or JAX's, and the set
 }
 
 
-@pytest.mark.parametrize("kind", [*list(COSTS)[:-1], pytest.param("ball", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", [*list(COSTS)[:-2], *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("searched", "ball"))]
+)
 def test_the_minimum_is_that_of_an_average_in_numpy_with_a_target_left_out(kind):
     cost, admissible = COSTS[kind]
     plant = hjb.Problem(
@@ -311,6 +314,7 @@ def linear_loop(robust):
     return sizes[0], (worst[0] * np.sqrt(START), worst[1 : 1 + STEPS] / np.sqrt(DT), worst[1 + STEPS :] / np.sqrt(DT))
 
 
+@pytest.mark.slow
 def test_minimum_stress_keeps_the_gain_that_certainty_equivalence_with_kalman_breaks():
     kalman_gain, against_kalman = linear_loop(robust=False)
     stress_gain, against_stress = linear_loop(robust=True)

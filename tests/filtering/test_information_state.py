@@ -181,6 +181,7 @@ def test_a_state_that_rests_is_bayes_to_rounding():
         assert tuple(law.mode[k]) == tuple(nodes[np.unravel_index(np.argmax(density), grid.shape)])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*at an end of the box", "ignore:.*narrower than a cell")
 @pytest.mark.parametrize("size", [pytest.param(1e3, marks=pytest.mark.slow), 1e8])
 def test_records_of_any_size_leave_no_mass_behind(size):
@@ -202,6 +203,7 @@ def test_records_of_any_size_leave_no_mass_behind(size):
 # --- the chain ---
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings(
     "ignore:.*at an end of the box", "ignore:.*narrower than a cell", "ignore:.*dt = .* is longer"
 )

@@ -140,6 +140,7 @@ def test_the_law_of_plant_and_record_is_that_of_the_equations():
     assert abs(np.mean(increments[:, 0] * increments[:, 1])) < 5e-4
 
 
+@pytest.mark.slow
 def test_errors_of_a_kalman_filter_have_the_covariance_that_it_says():
     observer = ExtendedKalman(LQ, position, [0.0, 0.0], [0.2, 0.2], measurement_noise=R)
     starts = np.random.default_rng(0).normal(size=(4000, 2)) * np.sqrt(0.2)

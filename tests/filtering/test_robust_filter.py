@@ -190,6 +190,7 @@ def filtered(start, y, u, scale=1.0, scheme=None):
     return robust_filter(PLANT, angle, RING, y, 0.3, start, gamma=1.2 * scale**0.5, controls=u, scheme=scheme)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*at an end of the box")
 @given(seed=SEEDS)
 @settings(max_examples=15)
@@ -263,6 +264,7 @@ def test_single_precision_follows():
     np.testing.assert_allclose(observer.estimate(state), exact.worst_case[-1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_function_that_reads_a_number_from_elsewhere_is_looked_at_again():
     class Gain:
         value = 1.0
@@ -356,6 +358,7 @@ def test_an_interval_of_too_many_inner_steps_is_refused():
         filtered(2.7e4)
 
 
+@pytest.mark.slow
 def test_correlated_measurements_count_as_their_whitened_ones():
     root = np.array([[0.5, 0.0], [0.8, 1.5]])
     inverse = np.linalg.inv(root)

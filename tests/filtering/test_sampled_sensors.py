@@ -36,6 +36,7 @@ def grid_filter():
     return F.GridFilter(PLANT, identity, GRID, lambda x: jnp.exp(-((x - 1) @ (x - 1)) / 0.4))
 
 
+@pytest.mark.slow
 def test_a_prediction_is_the_law_of_the_plant():
     with jax.enable_x64(True):
         mean, variance = moved(1.0, 0.2, 0.8)

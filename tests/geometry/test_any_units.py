@@ -39,6 +39,7 @@ def test_a_stiff_motor_is_controllable_at_every_depth(inductance):
     assert min(seen.margin, geometry.reachability_distribution(plant.drift, plant.push, np.zeros(3), 2).margin) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stiffness", "inertia"), [(1e4, 1e-2), (1e6, 1e-4), (1e9, 1e-6)])
 def test_a_stiff_joint_is_controllable_and_observable(stiffness, inertia):
     arm = zoo.FlexibleJoint(stiffness=stiffness, motor=inertia)
@@ -83,6 +84,7 @@ def test_linear_systems_have_the_exact_rank_of_kalman_in_any_units(seed):
         assert (rank, observed) == (kalman, seen), spread
 
 
+@pytest.mark.slow
 def test_what_is_out_of_reach_stays_out_of_reach():
     # Two equal pendulums under one torque move alike; a mode by itself does not move; cos(π/2) is rounding.
     pair = geometry.affine_fields(lambda x, u: jnp.stack([x[1], jnp.sin(x[0]) + u[0], x[3], jnp.sin(x[2]) + u[0]]), 1)
@@ -121,7 +123,9 @@ def test_ranks_in_float32_are_those_of_float64():
 # Relative degree
 
 
-@pytest.mark.parametrize("rate", [1.0, 1e-3, 1e-5, 1e-9])
+@pytest.mark.parametrize(
+    "rate", [1.0, pytest.param(1e-3, marks=pytest.mark.slow), pytest.param(1e-5, marks=pytest.mark.slow), 1e-9]
+)
 def test_a_chain_of_integrators_has_its_relative_degree_in_any_units(rate):
     f, g = (lambda x: rate * jnp.stack([x[1], x[2], 0.0])), (lambda x: jnp.array([0.0, 0.0, 1.0]))
     degree = geometry.relative_degree(f, g, lambda x: x[0], np.zeros(3))
@@ -137,6 +141,7 @@ def test_a_weak_feedthrough_counts():
     assert "no input above the tolerance reaches output 0" in lost.message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inductance", [1e-3, 1e-6])
 def test_the_verdicts_on_a_motor_agree(inductance):
     plant = motor(inductance)
@@ -199,10 +204,10 @@ def test_a_definite_function_is_not_violated_by_its_units(widths):
     ("level", "positive"),
     [
         (lambda x: 3 + jnp.sum(x**8), True),  # at 0.01 by 1e-16, below the digits of 3
-        (lambda x: 1 + 1e-20 * (x @ x), True),
-        (lambda x: 3 - jnp.sum(x**8), False),
+        pytest.param(lambda x: 1 + 1e-20 * (x @ x), True, marks=pytest.mark.slow),
+        pytest.param(lambda x: 3 - jnp.sum(x**8), False, marks=pytest.mark.slow),
         (lambda x: 3 + x[0] ** 8, False),
-        (lambda x: 3 + jnp.maximum(x @ x - 0.09, 0) ** 2, False),
+        pytest.param(lambda x: 3 + jnp.maximum(x @ x - 0.09, 0) ** 2, False, marks=pytest.mark.slow),
         (lambda x: 3 + (x @ x) * (x @ x - 0.25) ** 2, False),
     ],
 )

@@ -189,6 +189,7 @@ def test_example_41_is_accessible_everywhere():
     assert ranks == [1, 1, 2]
 
 
+@pytest.mark.slow
 def test_example_42_is_observable_locally_and_not_globally():
     system = zoo.Angle()
     f, gs = geometry.affine_fields(system.drift, 1)
@@ -209,6 +210,7 @@ def test_example_42_is_observable_locally_and_not_globally():
     assert np.max(np.abs(outputs[0] - outputs[2])) > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "start"), [(zoo.Unicycle(), [0.0, 0.0, 0.5]), (zoo.CarWithTrailers(), [0.0, 0.0, 0.5, 0.9])]
 )
@@ -272,6 +274,7 @@ def nonholonomy(trailers, angles, deepest):
     return None
 
 
+@pytest.mark.slow
 def test_a_car_with_one_trailer_has_degree_three_everywhere():
     for bend in (0.0, 0.6, np.pi / 2):
         assert nonholonomy(1, [0.4, 0.4 - bend], 4) == 3

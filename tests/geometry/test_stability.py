@@ -206,11 +206,11 @@ class Bump:
     ("level", "positive"),
     [
         (lambda x: x @ x, True),
-        (lambda x: jnp.sum(x**4), True),
-        (lambda x: jnp.sum(x**6) + 3.0, True),
+        pytest.param(lambda x: jnp.sum(x**4), True, marks=pytest.mark.slow),
+        pytest.param(lambda x: jnp.sum(x**6) + 3.0, True, marks=pytest.mark.slow),
         (lambda x: x[0] ** 2, False),
         (lambda x: x[0] ** 2 - 0.1 * x[1] ** 2, False),
-        (lambda x: (x[0] - x[1]) ** 2 + (x @ x) ** 2 * (x @ x - 0.5), False),
+        pytest.param(lambda x: (x[0] - x[1]) ** 2 + (x @ x) ** 2 * (x @ x - 0.5), False, marks=pytest.mark.slow),
     ],
 )
 def test_a_function_that_is_not_positive_is_found_out(level, positive):

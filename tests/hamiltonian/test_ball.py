@@ -61,7 +61,9 @@ def test_a_ball_is_optimal_over_a_scan(dim, kinks, curved, seed):
         assert np.all(sign * value <= np.min(sign * scan, axis=0) + 1e-9)
 
 
-@pytest.mark.parametrize("units", [1.0, 1e-7, 1e6])
+@pytest.mark.parametrize(
+    "units", [pytest.param(1.0, marks=pytest.mark.slow), pytest.param(1e-7, marks=pytest.mark.slow), 1e6]
+)
 def test_the_least_quadratic_in_a_ball_against_scipy(units):
     """Of one cell the optimum to rounding, also where the quadratic is concave, where b = 0, and of any size."""
     rng = np.random.default_rng(5)

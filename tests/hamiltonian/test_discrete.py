@@ -19,7 +19,8 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite, samples
 
-CASES = [(1, "diagonal"), (2, "none"), (2, "matrix"), (2, "function"), (3, "diagonal"), (3, "matrix"), (4, "matrix")]
+CASES = [(1, "diagonal"), (2, "none"), (2, "matrix"), (2, "function"), (3, "matrix")]
+CASES += [pytest.param(n, kind, marks=pytest.mark.slow) for n, kind in ((3, "diagonal"), (4, "matrix"))]
 SCHEMES = [Upwind(central=False), Upwind(central=True)]
 UNIT = Box([-1.0], [1.0])
 
@@ -101,8 +102,13 @@ def check_minimum(problem, grid, value, scan, scheme):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
-@pytest.mark.parametrize("kind", ["none", "matrix"])
-@pytest.mark.parametrize("cost", ["cost", "affine_cost"])
+@pytest.mark.parametrize(
+    ("cost", "kind"),
+    [
+        ("cost", "none"), ("cost", "matrix"), ("affine_cost", "none"),
+        pytest.param("affine_cost", "matrix", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 @given(seed=SEEDS)
 @settings(max_examples=8)
 def test_a_box_is_minimised_exactly(cost, kind, scheme, seed):
@@ -277,7 +283,7 @@ def test_upwinding_opens_a_gap_at_a_kink():
     assert np.isclose(optimal(problem, grid, value, Upwind(), "lower")[0][1], 0)
 
 
-@pytest.mark.parametrize("slope", [2.0, -0.5])
+@pytest.mark.parametrize("slope", [2.0, pytest.param(-0.5, marks=pytest.mark.slow)])
 def test_a_squared_difference_has_a_gap_everywhere(slope):
     """ẋ = (u − d)²: min max is p⁺ and max min −p⁻, so they differ by |p|."""
     problem = Problem(lambda x, u, d: (u - d) ** 2, None, UNIT, disturbances=UNIT, discount=1.0)

@@ -93,7 +93,7 @@ def test_two_inputs_are_optimal_over_a_scan(count, kinks, curved, seed):
         assert np.all(sign * value <= np.min(sign * scan, axis=(0, 1)) + 1e-11)
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @settings(max_examples=15)
 def test_kinks_that_coincide_hide_no_stationary_point(count, seed):

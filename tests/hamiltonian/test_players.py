@@ -39,8 +39,10 @@ def plain():
     ("drift", "cost", "controls"),
     [
         (lambda x, u: jax.lax.stop_gradient(u), lambda x, u: x @ x + 0.1 * u @ u, UNIT),
-        (lambda x, u: timid(u), lambda x, u: x @ x + 0.1 * u @ u, UNIT),
-        (lambda x, u: u, lambda x, u: x @ x + 0.1 * timid(u) @ jax.lax.stop_gradient(u), UNIT),
+        pytest.param(lambda x, u: timid(u), lambda x, u: x @ x + 0.1 * u @ u, UNIT, marks=pytest.mark.slow),
+        pytest.param(
+            lambda x, u: u, lambda x, u: x @ x + 0.1 * timid(u) @ jax.lax.stop_gradient(u), UNIT, marks=pytest.mark.slow
+        ),
         (lambda x, u: timid(u), lambda x, u: x @ x + 0.1 * u @ u, hjb.Ball(1.0, 1)),
     ],
     ids=["stop_gradient", "custom_jvp", "cost", "ball"],

@@ -125,7 +125,7 @@ CASES += [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW]
 
 
 @pytest.mark.parametrize(("m", "kind"), CASES)
-@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("noisy", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_shared_inputs_are_optimal(m, kind, noisy):
     admissible = admissible_set(kind, m)
     for seed in range(2):
@@ -141,6 +141,7 @@ def test_shared_inputs_are_optimal(m, kind, noisy):
             assert best[index] >= node.minimum(admissible) - 1e-5  # what SLSQP leaves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param("box", marks=pytest.mark.slow), "ball"])
 def test_single_precision_is_as_good_as_its_rounding(kind):
     numbers, value, sigma = drawn(0, 3)
@@ -187,7 +188,7 @@ def test_a_cost_that_is_not_convex_is_known():
     assert not np.any(known(jnp.asarray(np.array([[0.0, 1.0], [1.0, 0.0]])[..., None])))
 
 
-@pytest.mark.parametrize("m", [4, 5, 6])
+@pytest.mark.parametrize("m", [4, pytest.param(5, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.slow)])
 def test_singular_convex_costs_are_convex(m):
     """Rounding in the elimination grew with the number of inputs, and took 2 % of such costs for concave."""
     rng = np.random.default_rng(m)

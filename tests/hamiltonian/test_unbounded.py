@@ -82,7 +82,7 @@ def test_riccati_without_bounds(price, discount):
     np.testing.assert_allclose(solution.policy[:, 0], -p * x / price, rtol=0, atol=5e-3 / np.sqrt(price))
 
 
-@pytest.mark.parametrize("noise", [None, 0.6])
+@pytest.mark.parametrize("noise", [None, pytest.param(0.6, marks=pytest.mark.slow)])
 def test_bounds_too_wide_to_matter_give_the_same_bits(noise):
     found, wide = (
         hjb.solve(regulator(box, noise=noise), LINE, scheme=hjb.Upwind(), tol=1e-8)

@@ -24,6 +24,7 @@ from hjbjax.problem.sets import Ball, Box, Finite
 
 UNIT = Box([-1.0], [1.0])
 NOISES = ["none", "diagonal", "matrix"]
+FEW = [pytest.param("none", marks=pytest.mark.slow), pytest.param("diagonal", marks=pytest.mark.slow), "matrix", "game"]
 laws = settings(max_examples=12)
 # the old emitters take minutes: every candidate of a minimum reads several neighbours, and more with noise
 jitted = functools.partial(jax.jit, compiler_options=xla.with_emitters())
@@ -83,7 +84,7 @@ def test_order_is_kept(kind, seed):
         assert jnp.all(below <= above + 1e-12)
 
 
-@pytest.mark.parametrize("kind", [*NOISES, "game"])
+@pytest.mark.parametrize("kind", FEW)
 @given(seed=SEEDS)
 @laws
 def test_contraction(kind, seed):
@@ -94,7 +95,7 @@ def test_contraction(kind, seed):
     assert jnp.max(jnp.abs(first - second)) <= (1 - shrink) * np.max(np.abs(value - other)) + 1e-12
 
 
-@pytest.mark.parametrize("kind", [*NOISES, "game"])
+@pytest.mark.parametrize("kind", FEW)
 @given(seed=SEEDS)
 @laws
 def test_a_constant_shifts_the_rate_by_the_discount(kind, seed):
@@ -140,6 +141,7 @@ class Turned:
         return self.sign * jnp.stack([x[self.order.index(i)] for i in range(len(self.order))])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @settings(max_examples=6)
@@ -215,7 +217,7 @@ def _equation(problem, grid, value, obstacles):
     return policy, bellman.policy_equation(upwind(problem, grid), value, policy, obstacles)
 
 
-@pytest.mark.parametrize("kind", [*NOISES, "game"])
+@pytest.mark.parametrize("kind", FEW)
 @given(seed=SEEDS)
 @laws
 def test_the_source_is_the_residual_and_the_weights_are_the_chain(kind, seed):
@@ -246,7 +248,7 @@ def _with_every_rate(problem, grid, value, policy, obstacles):
     return bellman.policy_equation(upwind(problem, grid), value, policy, obstacles, every_rate=True)
 
 
-@pytest.mark.parametrize("kind", ["none", "matrix"])
+@pytest.mark.parametrize("kind", [pytest.param("none", marks=pytest.mark.slow), "matrix"])
 @given(seed=SEEDS)
 @settings(max_examples=6)
 def test_an_equation_returns_the_fastest_rate_and_accepts_it(kind, seed):
@@ -275,7 +277,7 @@ def test_every_rate_counts_where_none_is_rounding():
     np.testing.assert_allclose(slow.source[:3], 1 / 4e6, rtol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @settings(max_examples=6)
 def test_the_correction_of_a_policy_is_its_value(n, seed):
@@ -295,7 +297,14 @@ def test_the_correction_of_a_policy_is_its_value(n, seed):
     assert np.allclose(value.ravel() + delta, exact, rtol=0, atol=1e-9 * (1 + np.max(np.abs(exact))))
 
 
-@pytest.mark.parametrize("controls", [Box([-1.0, 0.0], [1.0, 2.0]), Ball(1.5, 2), Finite([[0.0, 1.0], [1.0, -1.0]])])
+@pytest.mark.parametrize(
+    "controls",
+    [
+        Box([-1.0, 0.0], [1.0, 2.0]),
+        pytest.param(Ball(1.5, 2), marks=pytest.mark.slow),
+        Finite([[0.0, 1.0], [1.0, -1.0]]),
+    ],
+)
 @given(seed=SEEDS)
 @settings(max_examples=5)
 def test_no_action_is_faster_than_the_fastest_rate(controls, seed):

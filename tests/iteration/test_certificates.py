@@ -122,8 +122,13 @@ def discounted(rng, kind, n, with_rules):
     return problem, grid, obstacles
 
 
-@pytest.mark.parametrize("with_rules", [False, True])
-@pytest.mark.parametrize(("n", "kind"), [(1, "diagonal"), (2, "none"), (2, "matrix")])
+@pytest.mark.parametrize(
+    ("n", "kind", "with_rules"),
+    [
+        (1, "diagonal", False), (1, "diagonal", True), (2, "none", False), (2, "matrix", True),
+        *(pytest.param(2, *each, marks=pytest.mark.slow) for each in (("none", True), ("matrix", False))),
+    ],
+)  # fmt: skip
 @given(seed=SEEDS)
 @laws
 def test_the_discounted_bound_contains_the_exact_solution(n, kind, with_rules, seed):
@@ -152,7 +157,7 @@ def test_the_discounted_bound_is_sharp():
     assert np.isclose(gap.error, 0.25, rtol=1e-14)
 
 
-@pytest.mark.parametrize(("n", "kind"), [(1, "none"), (2, "diagonal")])
+@pytest.mark.parametrize(("n", "kind"), [pytest.param(1, "none", marks=pytest.mark.slow), (2, "diagonal")])
 @given(seed=SEEDS)
 @laws
 def test_the_undiscounted_bound_contains_the_exact_solution(n, kind, seed):

@@ -62,7 +62,14 @@ def test_a_slow_run_of_samples_is_not_slowed_down():
 
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
-@pytest.mark.parametrize(("scheme", "stages"), [(hjb.Upwind(), 2), (hjb.Limited(), None), (hjb.Upwind(), 3)])
+@pytest.mark.parametrize(
+    ("scheme", "stages"),
+    [
+        (hjb.Upwind(), 2),
+        pytest.param(hjb.Limited(), None, marks=pytest.mark.slow),
+        pytest.param(hjb.Upwind(), 3, marks=pytest.mark.slow),
+    ],
+)
 def test_a_drift_that_switches_on_within_a_step_is_not_outrun(scheme, stages):
     """At rest the limit is endless and a step a hundredth of the horizon; within one the rate becomes 800."""
 
@@ -107,7 +114,12 @@ SWUNG = hjb.Problem(lambda x, u: -x, lambda x, u: x[0] * x[1], UNIT, noise=swung
 
 
 @pytest.mark.parametrize(
-    "method", [hjb.Explicit(), hjb.Explicit(stages=2), pytest.param(hjb.Implicit(), marks=pytest.mark.slow)]
+    "method",
+    [
+        hjb.Explicit(),
+        pytest.param(hjb.Explicit(stages=2), marks=pytest.mark.slow),
+        pytest.param(hjb.Implicit(), marks=pytest.mark.slow),
+    ],
 )
 def test_a_march_stops_where_its_noise_cannot_be_represented(method):
     """The noise is fine at t = 0, where a problem is looked at before it starts."""

@@ -123,6 +123,7 @@ def toll(x, u):
     return 3 * (1 - jnp.abs(x[0]))
 
 
+@pytest.mark.slow
 def test_slowing_down_is_exact():
     problem = hjb.Problem(slowing, toll, hjb.Box([-1.0], [1.0]), discount=1.0)
     for shape in ((21,), (22,)):  # with and without a node on the kink
@@ -133,7 +134,7 @@ def test_slowing_down_is_exact():
         assert np.max(off[away]) <= 1e-10
 
 
-@pytest.mark.parametrize("dim", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("discount", [0.0, 1.0])
 def test_moving_along_the_axes_is_exact(dim, discount):
     problem, grid = zoo.eikonal(norm=1, dim=dim, discount=discount, radius=0.0, shape=(11,) * dim)

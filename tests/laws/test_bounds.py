@@ -24,7 +24,9 @@ def holds(name, seed):
     assert not verdict.complaints, f"{name}: {'; '.join(verdict.complaints)}"
 
 
-@pytest.mark.parametrize("name", EVERY_TIME)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name.startswith("line") else name for name in EVERY_TIME]
+)
 @given(seed=SEEDS)
 @laws
 def test_what_is_certified_holds(name, seed):

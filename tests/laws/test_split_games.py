@@ -74,6 +74,7 @@ def test_the_two_chains_differ_and_the_split_one_has_one_value():
     np.testing.assert_allclose(value_iteration(True), value_iteration(True, "lower"), atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1e5])
 def test_it_knows_no_unit_of_time(unit):
     scheme = hjb.Upwind(split=True)
@@ -131,6 +132,7 @@ def test_float32_batches_jit_and_derivatives():
     assert slope == pytest.approx((middle(0.31 + 1e-5) - middle(0.31 - 1e-5)) / 2e-5, rel=1e-4, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_players_who_cannot_be_told_apart_are_upwinded_by_their_sum():
     problem = hjb.Problem(
         lambda x, u, d: u * (1 + 0.5 * d), lambda x, u, d: x @ x, hjb.Finite(US[:, None]),
@@ -152,6 +154,7 @@ def test_a_march_of_long_duration_comes_to_the_stationary_value():
             np.testing.assert_allclose(found, known, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_two_axes_one_of_them_shared():
     """x is driven by both, y by the control: what the disturbance does not drive is exactly zero in its part."""
     grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (9, 8))

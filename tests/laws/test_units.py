@@ -171,6 +171,7 @@ def test_nor_does_an_implicit_march_of_small_costs():
     np.testing.assert_allclose(found / 1e-7, known, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_nor_does_a_solve_in_float32():
     known = hjb.solve(asked("discounted", Units()), GRID, tol=1e-4, dtype="float32", scheme=hjb.Upwind()).value
     for time, cost in UNITS:

@@ -20,8 +20,10 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
 
 PLAIN = Upwind(central=False)
-CASES = [(n, kind) for n in (1, 2, 3, 4) for kind in ("none", "scalar", "diagonal", "matrix")] + [(2, "function")]
+KINDS = ("none", "scalar", "diagonal", "matrix")
 FEW = [(1, "scalar"), (2, "none"), (2, "matrix"), (2, "function"), (3, "matrix")]
+REST = {(n, kind) for n in (1, 2, 3, 4) for kind in KINDS} - {(1, "none"), *FEW}
+CASES = [(1, "none"), *FEW, *(pytest.param(*case, marks=pytest.mark.slow) for case in sorted(REST))]
 UNIT = Box([-1.0], [1.0])
 laws = settings(max_examples=15)
 
@@ -129,7 +131,9 @@ def test_generator_equals_its_formula(n, kind, central, seed):
     assert np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize(("n", "kind"), [(1, "scalar"), (2, "matrix"), (2, "diagonal"), (3, "matrix")])
+@pytest.mark.parametrize(
+    ("n", "kind"), [(1, "scalar"), (2, "matrix"), (2, "diagonal"), pytest.param(3, "matrix", marks=pytest.mark.slow)]
+)
 @given(seed=SEEDS)
 @settings(max_examples=6)
 def test_steps_have_the_mean_and_the_covariance_of_the_diffusion(n, kind, seed):
@@ -176,7 +180,7 @@ def test_numbers_by_hand():
     assert against[0].tolist() == [-2, 2, 0]  # (a − h n)/h²: central differences hold the noise back
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
+@pytest.mark.parametrize("n", [1, 2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @laws
 def test_generator_and_adjoint_are_dual(n, seed):
@@ -294,7 +298,7 @@ def random_decision_problem(rng, n, kind, count=4, **ingredients):
     return random_problem(rng, grid, kind, controls, discount=rng.uniform(0.1, 2), **ingredients), grid
 
 
-@pytest.mark.parametrize(("n", "kind"), [*FEW, (4, "none")])
+@pytest.mark.parametrize(("n", "kind"), [*FEW, pytest.param(4, "none", marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @settings(max_examples=3)
 def test_pairs_are_the_rows_of_the_matrices(n, kind, seed):

@@ -96,6 +96,7 @@ def mean_under_the_law(p, grid, f=jnp.sum):
     return f(law * jnp.cos(x))
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_stationary_law():
     grid, p = hjb.Grid([-2.0], [2.0], (21,)), np.array([0.3, 1.2, 0.9, 0.4])
     forward, reverse = jax.jacfwd(mean_under_the_law)(p, grid), jax.grad(mean_under_the_law)(p, grid)

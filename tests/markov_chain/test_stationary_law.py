@@ -131,7 +131,15 @@ def test_a_density_under_the_policy_that_was_found():
 # --- laws of matrices ---
 
 
-@pytest.mark.parametrize(("n", "kind"), [(1, "scalar"), (2, "matrix"), (2, "none"), (3, "diagonal")])
+@pytest.mark.parametrize(
+    ("n", "kind"),
+    [
+        (1, "scalar"),
+        pytest.param(2, "matrix", marks=pytest.mark.slow),
+        (2, "none"),
+        pytest.param(3, "diagonal", marks=pytest.mark.slow),
+    ],
+)
 @given(seed=SEEDS)
 @settings(max_examples=15)
 def test_quantecon_finds_the_same_law(n, kind, seed):

@@ -56,6 +56,7 @@ def test_a_position_without_noise_has_the_law_of_kalman(count, most):
     assert np.all(law.density >= 0)
 
 
+@pytest.mark.slow
 def test_a_rotation_keeps_mass_sign_and_width():
     """x₁' = x₂, x₂' = −x₁ over a quarter of a turn."""
     turning = Problem(lambda x, u: jnp.stack([x[1], -x[0]]))
@@ -167,6 +168,7 @@ def test_the_filter_warns_outside_jit_alone():
     jax.jit(observer.update)(observer.initial(), *told)
 
 
+@pytest.mark.slow
 def test_two_narrow_peaks_are_narrow():
     """h = x² leaves x = ±1: the covariance of both is large, each peak is not resolved."""
     grid, record = Grid([-3.0], [3.0], (61,)), np.full((10, 1), 1e-4)

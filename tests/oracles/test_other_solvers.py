@@ -105,7 +105,15 @@ def test_all_methods_agree_and_their_bounds_hold_the_discrete_solution(name):
         assert np.max(np.abs(value - values[0])) <= 2 * TOL
 
 
-@pytest.mark.parametrize("name", ["one player", "with noise", pytest.param("minimum time", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("one player", marks=pytest.mark.slow),
+        "with noise",
+        pytest.param("minimum time", marks=pytest.mark.slow),
+    ],
+)
 def test_the_direct_solution_solves_the_linear_system_of_its_policy(name):
     """(I − P) V = Δt (L − β V) off the target, with the exported transition matrix and SciPy's solver."""
     from scipy.sparse import diags_array, eye_array
@@ -127,7 +135,7 @@ def test_the_direct_solution_solves_the_linear_system_of_its_policy(name):
     np.testing.assert_allclose(solution.value.reshape(-1), value, rtol=0, atol=1e-8 * (1 + np.max(np.abs(value))))
 
 
-@pytest.mark.parametrize("noise", [None, 0.4])
+@pytest.mark.parametrize("noise", [pytest.param(None, marks=pytest.mark.slow), 0.4])
 def test_quantecon_agrees_on_the_exported_chain(noise):
     from quantecon.markov import DiscreteDP
 

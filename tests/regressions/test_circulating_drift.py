@@ -23,6 +23,7 @@ def turning(x, u):
     return jnp.stack([x[1], -x[0] + 0.01 * u[0]])
 
 
+@pytest.mark.slow
 def test_an_oscillator_under_a_small_discount():
     problem = hjb.Problem(turning, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1e-4)
     solution = hjb.solve(problem, hjb.Grid([-2.0, -2.0], [2.0, 2.0], (15, 15)), tol=1e-6, scheme=hjb.Upwind())

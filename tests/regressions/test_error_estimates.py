@@ -63,6 +63,7 @@ def test_a_layer_that_is_thinner_than_a_cell():
     assert error / 3 < estimate < 3 * error
 
 
+@pytest.mark.slow
 def test_an_axis_of_two_nodes_is_a_chain_of_two_states():
     _, error, estimate = solved(known.income(41, 0.3, True), tol=1e-9)
     assert error < 1e-7

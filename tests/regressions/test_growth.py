@@ -89,6 +89,7 @@ def test_the_minimum_over_a_box_stays_exact_if_growth_is_affine():
     assert np.max(np.abs(found.policy - tried.policy)) <= 0.006
 
 
+@pytest.mark.slow
 def test_constant_growth_is_less_discount():
     chance = hjb.solve(quadratic(0.0, -0.25, lambda x: 0.35 + 0 * x[0]), GRID, scheme=CHAIN, tol=1e-9)
     number = hjb.solve(hjb.Problem(steer, paid, BOX, noise=0.3, discount=0.6), GRID, scheme=CHAIN, tol=1e-9)
@@ -98,6 +99,7 @@ def test_constant_growth_is_less_discount():
     assert np.allclose(none.value, number.value, rtol=0, atol=2e-9)
 
 
+@pytest.mark.slow
 def test_a_state_in_proportion_to_which_all_is_paid_may_be_left_out():
     """dK = K (u/2 − 0.1) dt, paid per K: V(K, x) = K v(x), by two solves of a chain that moves along x only."""
     v = hjb.solve(
@@ -112,6 +114,7 @@ def test_a_state_in_proportion_to_which_all_is_paid_may_be_left_out():
     assert np.allclose(found.value, np.asarray(grid.axis(0))[:, None] * v.value, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_batch_and_transformations_give_the_same_values():
     numbers = np.array([[0.3, 0.1], [-0.2, -0.3]])
     alone = [hjb.solve(quadratic(*row), GRID, scheme=CHAIN, tol=1e-9) for row in numbers]
@@ -173,6 +176,7 @@ def test_an_implicit_step_that_is_too_long_for_the_growth_is_refused():
         hjb.march(growing, GRID, 2.0, method=hjb.Implicit(), step=0.5)
 
 
+@pytest.mark.slow
 def test_a_game_with_growth():
     """min max over u, d of growth times V, where V is the number 1/(β − g) for a running cost of one."""
     problem = hjb.Problem(

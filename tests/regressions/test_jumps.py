@@ -25,7 +25,9 @@ def assert_certified(found, exact, seed):
 
 @pytest.mark.parametrize(
     ("kind", "count"),
-    [(kind, 1) for kind in KINDS] + [pytest.param(kind, 2, marks=pytest.mark.slow) for kind in KINDS],
+    [("landings that the control steers", 1), pytest.param("noise", 1, marks=pytest.mark.slow)]
+    + [pytest.param("no noise", 1, marks=pytest.mark.slow)]
+    + [pytest.param(kind, 2, marks=pytest.mark.slow) for kind in KINDS],
 )
 def test_random_problems_agree_with_a_dense_dynamic_program(kind, count):
     for seed in range(3):
@@ -147,6 +149,7 @@ def test_the_generator_has_the_rates_of_the_jumps():
     assert np.allclose(generator, expected)
 
 
+@pytest.mark.slow
 def test_a_value_without_a_policy_has_a_box_error():
     problem = hjb.Problem(
         lambda x, u: -x, lambda x, u: x @ x, noise=0.4, discount=1.0, jumps=[hjb.Jump(0.5, lambda x, u: x / 2)]
@@ -165,6 +168,7 @@ def test_a_periodic_jump_wraps():
     assert np.allclose(generator + np.eye(4), [[0, 0.5, 0.5, 0], [0, 0, 0.5, 0.5], [0.5, 0, 0, 0.5], [0.5, 0.5, 0, 0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beta", [0.3, 1.0])
 def test_ruin_at_a_constant_rate_is_a_discount(beta):
     # a jump into the target at the rate λ: (β + λ) V = L + λ g
@@ -176,6 +180,7 @@ def test_ruin_at_a_constant_rate_is_a_discount(beta):
     assert np.allclose(found.value[1:], (2.0 + 0.25 * (7.0 + 1.0)) / (beta + 0.25), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_jump_is_the_only_way_to_a_target():
     # drift away from the target, without discount: E τ = 1/λ, and only the control u = 1 makes the jump possible
     problem = hjb.Problem(
@@ -199,6 +204,7 @@ def test_a_jump_into_a_trap_is_a_value_of_infinity():
     assert np.all(np.isinf(found.value[21:]))
 
 
+@pytest.mark.slow
 def test_linear_value_with_jumps_and_open_ends_is_exact():
     # β V = x + λ (V(x + 1) − V(x)) with V = x/β + λ/β²
     problem = hjb.Problem(
@@ -346,6 +352,7 @@ def test_rewards_of_jumps_are_minus_costs():
         hjb.Jump(1.0, land, 1.0, reward=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["discount", "controls"])
 def test_a_discount_and_bounds_of_the_state_that_are_constant_change_nothing(change):
     grid, plain = hjb.Grid([0.0], [2.0], (21,)), falling(0.4, 0.3)

@@ -31,7 +31,12 @@ def assert_certified(found, exact, seed):
     assert np.all(exact <= upper + slack), seed
 
 
-@pytest.mark.parametrize("kind", KINDS)
+QUICK = ("both", "rates that the control steers")
+
+
+@pytest.mark.parametrize(
+    "kind", [*QUICK, *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS if kind not in QUICK)]
+)
 def test_random_problems_agree_with_a_dense_dynamic_program(kind):
     for seed in range(6):
         one = random_modes.draw(seed)
@@ -79,6 +84,7 @@ def test_every_method_finds_the_same_value(method):
         assert np.max(np.abs(found.value - exact)) <= 1e-7
 
 
+@pytest.mark.slow
 def test_a_batch_and_a_transformation_give_the_same_values():
     ones = [random_modes.draw(seed) for seed in range(3)]
     problems = [random_modes.problem(one) for one in ones]
@@ -159,6 +165,7 @@ def test_the_generator_has_the_rates_of_the_modes():
     assert np.allclose(generator.sum(axis=1), 0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("price", [0.3, 1.0, 3.0])
 def test_a_machine_that_fails_is_a_two_state_chain(price):
     # nothing moves: β V_i = L_i + λ_ij (V_j − V_i), and a repair by choice costs c
@@ -332,6 +339,7 @@ def test_random_changes_have_their_law():
     assert abs(np.mean(costs) - total) < 4 * np.std(costs) / np.sqrt(2000)
 
 
+@pytest.mark.slow
 def test_rounding_of_a_time_of_change_does_not_alter_the_later_changes():
     def modes(rate):
         chances = hjb.Modes(("a", "b", "c"), rates=rate * (1 - np.eye(3)))
@@ -375,7 +383,7 @@ def test_a_grid_with_modes_is_refused_by_a_problem_without_them(solved):
     assert hjb.solve(plain, found.in_mode("calm").grid).status.name == "CONVERGED"
 
 
-def test_mistakes_are_refused_with_the_mode():
+def test_mistakes_are_refused_with_the_mode(solved):
     fine = {"modes": hjb.Modes(("a", "b"), rates=[[0, 1], [1, 0]]), "discount": 1.0}
     with pytest.raises(ValueError, match=r"in mode 'b': drift\(x, u\) returned shape \(2,\)"):
         hjb.solve(hjb.Problem(lambda x, u, mode: jnp.zeros(1 + mode), **fine), LINE)
@@ -389,7 +397,7 @@ def test_mistakes_are_refused_with_the_mode():
     with pytest.raises(ValueError, match=r"Modes.rates: rates\(x, u\) returned shape \(2,\)"):
         hjb.solve(hjb.Problem(lambda x, u, mode: 0 * x, modes=flat, discount=1.0), LINE)
     with pytest.raises(ValueError, match="wanted one of"):
-        hjb.solve(hjb.Problem(lambda x, u, mode: 0 * x, **fine), LINE).value_at([0.0], mode="c")
+        solved[1].value_at([0.0], mode="c")
     with pytest.raises(ValueError, match="which this function does not take"):
         hjb.filtering.GridFilter(
             hjb.Problem(lambda x, u, mode: 0 * x, noise=1.0, **fine),
@@ -470,12 +478,11 @@ def test_functions_that_do_not_know_modes_refuse_them():
         hjb.least_restrictive(found, lambda t, x: 0 * x)
 
 
-def test_a_grid_of_other_modes_is_refused():
-    grid = hjb.Grid([-2.0], [2.0], (5,))
-    named = hjb.solve(plant([[0, 0.5], [0.8, 0]]), grid, tol=1e-3).grid
+def test_a_grid_of_other_modes_is_refused(solved):
+    _, found = solved
     other = hjb.Modes(("park", "drive"), rates=np.ones((2, 2)))
     with pytest.raises(ValueError, match="got a grid with the modes"):
-        hjb.solve(drifting(other, discount=1.0), named)
+        hjb.solve(drifting(other, discount=1.0), found.grid)
 
 
 def test_states_without_a_mode_or_with_an_unknown_one_are_refused(solved):

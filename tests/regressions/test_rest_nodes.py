@@ -75,6 +75,7 @@ def earning(x, u):
     return jnp.where(x[0] > 1.0, -20.0, x[0] ** 2)
 
 
+@pytest.mark.slow
 def test_a_rest_node_is_left_for_a_place_that_earns():
     problem = hjb.Problem(carried, earning, U, target=lambda x: 1.55 - x[0])
     solution = hjb.solve(problem, hjb.Grid([-1.0], [2.0], (31,)), tol=1e-6, scheme=hjb.Upwind())
@@ -98,7 +99,7 @@ def fast(rate, x, u):
     ("cost", "rate", "dtype"),
     [
         pytest.param(1e-3, 1.0, "float32", marks=pytest.mark.slow),
-        (1e-4, 1.0, "float32"),
+        pytest.param(1e-4, 1.0, "float32", marks=pytest.mark.slow),
         (1e-13, 1.0, None),
         (1e9, 1e6, None),
         (1.0, 1e-6, None),
@@ -114,6 +115,7 @@ def test_rest_is_told_by_like_beside_like(cost, rate, dtype):
     assert np.count_nonzero(solution.value == 0) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [[[1.0], [1.0]], [[0.5], [-0.5]]])
 def test_correlated_noise_leaves_no_rest(noise):
     """On equal spacings all of it moves along diagonals, and nothing along the axes."""
@@ -141,7 +143,7 @@ def valley(x, u):
 
 
 @pytest.mark.filterwarnings("ignore:the feedback never arrives")  # V is the same all over the valley
-@pytest.mark.parametrize("exit_cost", [5.0, 0.1, -3.0])
+@pytest.mark.parametrize("exit_cost", [5.0, 0.1, pytest.param(-3.0, marks=pytest.mark.slow)])
 def test_going_back_and_forth_at_no_cost_is_a_rest(exit_cost):
     """Both actions move, so that no node rests: without a hold any constant between 0 and the way out is a solution."""
     grid, step = hjb.Grid([0.0], [2.0], (21,)), 0.1

@@ -19,6 +19,7 @@ MORE = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 @pytest.mark.parametrize(
     ("torque", "shape", "known"), [*SWINGS, *(pytest.param(*each, marks=pytest.mark.slow) for each in MORE)]
@@ -32,6 +33,7 @@ def test_a_pendulum_of_several_swings_does_not_slide_off_its_rest_node(torque, s
     assert float(solution.value_at(HANGING)) == pytest.approx(known, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 @pytest.mark.parametrize(("time", "cost"), [(1e6, 1e9), (1e-6, 1e-9)])
 def test_units_of_time_and_cost_do_not_matter(time, cost):

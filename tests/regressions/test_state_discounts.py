@@ -44,7 +44,7 @@ def line_problem(line, rewards):
 
 
 @pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
-@pytest.mark.parametrize("rewards", [False, True], ids=["costs", "rewards"])
+@pytest.mark.parametrize("rewards", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["costs", "rewards"])
 def test_random_problems_agree_with_dense_linear_algebra_and_bounds_hold(rewards):
     for seed in range(15):
         line = draw(seed + 100 * rewards)
@@ -59,6 +59,7 @@ def test_random_problems_agree_with_dense_linear_algebra_and_bounds_hold(rewards
         assert found.error <= 1e-6
 
 
+@pytest.mark.slow
 def test_a_constant_function_is_the_number():
     number, function = (
         hjb.solve(hjb.Problem(steer, paid, BOX, noise=0.4, discount=each), GRID, scheme=CHAIN)
@@ -99,6 +100,7 @@ def test_a_perpetuity_under_vasiceks_short_rate_solves_its_ode():
     assert np.max(np.abs(found.value - exact)) <= 3 * np.max(found.grid_error) + 1e-3
 
 
+@pytest.mark.slow
 def test_a_decaying_stock_under_mortality_in_closed_form():
     """x' = −x/2 with utility x: V(x) = ∫ x e^{−t/2} exp(−ρ t − s x² (1 − e^{−t})) dt."""
     rho, slope = 0.1, 0.2

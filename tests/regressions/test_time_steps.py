@@ -13,7 +13,14 @@ PAIR = hjb.Finite([[-1.0], [1.0]])
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"scheme": hjb.Upwind()}, {"method": hjb.Explicit(4)}, {"method": hjb.Implicit()}], ids=str
+    "options",
+    [
+        {},
+        pytest.param({"scheme": hjb.Upwind()}, marks=pytest.mark.slow),
+        pytest.param({"method": hjb.Explicit(4)}, marks=pytest.mark.slow),
+        pytest.param({"method": hjb.Implicit()}, marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
 def test_the_discount_is_integrated_exactly(options):
     """One step whatever the horizon: V(1) was 0.505 and, by ``Upwind()``, 0.1."""
@@ -23,7 +30,10 @@ def test_the_discount_is_integrated_exactly(options):
         assert solution.value_at(0.0, [1.0]) == pytest.approx(np.exp(-horizon), abs=1e-7)
 
 
-@pytest.mark.parametrize(("stages", "order"), [(1, 1), (2, 2), (3, 3), (4, 3)])
+@pytest.mark.parametrize(
+    ("stages", "order"),
+    [(1, 1), pytest.param(2, 2, marks=pytest.mark.slow), pytest.param(3, 3, marks=pytest.mark.slow), (4, 3)],
+)
 def test_a_discount_keeps_the_order_in_time(stages, order):
     """ẋ = −x, cost x and discount 2 on two nodes, whose equation is linear: by half as long steps."""
     problem = hjb.Problem(lambda x, u: -x, lambda x, u: x[0] ** 2, discount=2.0, terminal_cost=lambda x: 2 * x[0])
@@ -37,6 +47,7 @@ def test_a_discount_keeps_the_order_in_time(stages, order):
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [1e4, 1e5])
 def test_a_long_clock_in_single_precision(horizon):
     """At 1e5 the clock, which float32 rounds to 0.008, made 896,657 steps to |V| = 7583."""
@@ -60,12 +71,17 @@ def pulse(t):
     return jnp.where(jnp.abs(t - 0.5003) < 0.002, 250.0, 0.0)
 
 
-@pytest.mark.parametrize("scheme", [None, hjb.Upwind(), hjb.Weno5()], ids=str)
+@pytest.mark.parametrize(
+    "scheme",
+    [None, pytest.param(hjb.Upwind(), marks=pytest.mark.slow), pytest.param(hjb.Weno5(), marks=pytest.mark.slow)],
+    ids=str,
+)
 def test_an_oscillation_between_the_steps_is_seen(scheme):
     """It is 2 at every hundredth of the horizon: V was 2, by ``Weno5()`` 0.667."""
     assert accrued(fast, scheme=scheme) == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*change faster than steps of")
 def test_a_pulse_between_the_steps_is_seen():
     assert accrued(pulse) == pytest.approx(1, abs=0.05)
@@ -76,11 +92,13 @@ def test_a_given_step_that_misses_functions_of_the_time_is_told():
         accrued(fast, step=0.01)
 
 
+@pytest.mark.slow
 def test_smooth_functions_of_the_time_take_a_hundred_steps():
     problem = hjb.Problem(lambda t, x, u: 0 * x, lambda t, x, u: 1 + jnp.cos(2 * jnp.pi * t), time_dependent=True)
     assert hjb.march(problem, LINE, 1.0).steps == 100
 
 
+@pytest.mark.slow
 def test_the_gap_is_the_largest_of_all_steps():
     """An opponent who counts from 0.3 to 0.6 alone: the gap was that of the last time, 0."""
     problem = hjb.Problem(
@@ -93,7 +111,7 @@ def test_the_gap_is_the_largest_of_all_steps():
 
 
 @pytest.mark.filterwarnings("ignore:the grid is coarse", "ignore:the box decides")
-@pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()])
+@pytest.mark.parametrize("method", [hjb.Explicit(), pytest.param(hjb.Implicit(), marks=pytest.mark.slow)])
 def test_what_is_cut_is_counted_in_all_steps(method):
     """Drift that leaves the box from 0.3 to 0.6 only: nothing was cut off at the kept times."""
     pulled = hjb.Problem(
@@ -122,6 +140,7 @@ def test_a_step_above_the_limit_is_nan_in_transformations():
     assert jax.jit(lambda a: there(a, 0.01))(1.0) == pytest.approx(0.0417, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_bounded_disturbance_is_answered_alike_on_the_host_and_in_transformations():
     """A cost −d² with |d| ≤ 0.3 was DIVERGED on the host."""
 
@@ -139,12 +158,14 @@ def test_a_kept_time_may_be_a_rounding_beyond_the_horizon():
     assert hjb.march(problem, LINE, 0.3, times=np.arange(4) * 0.1).times[-1] == 0.3
 
 
+@pytest.mark.slow
 def test_an_implicit_march_over_next_to_no_time():
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, UNIT)
     solution = hjb.march(problem, LINE, 1e-300, method=hjb.Implicit())
     assert np.max(np.abs(solution.value)) < 1e-299
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the box decides V")
 def test_implicit_steps_settle_where_one_control_steers_the_noise():
     """The search went to and fro between two actions that are nearly as good: STALLED at t = 0.4."""

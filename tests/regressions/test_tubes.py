@@ -85,6 +85,7 @@ def test_every_path_to_a_tube_starts_from_its_constraint(name):
         assert np.allclose(traced(make, which), alone.value, atol=1e-12), which
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_tube():
     """V = l outside where nothing moves, and l at the middle inside: both fall as the ball grows."""
     with jax.enable_x64(True):
@@ -97,7 +98,8 @@ def free(x, u):
 
 
 @pytest.mark.parametrize(
-    ("scale", "nodes", "half"), [(1, 61, 3.0), (1e-3, 61, 3.0), (1e6, 61, 3.0), (1, 4001, 3.0), (1, 401, 0.1)]
+    ("scale", "nodes", "half"),
+    [(1, 61, 3.0), (1e-3, 61, 3.0), (1e6, 61, 3.0), pytest.param(1, 4001, 3.0, marks=pytest.mark.slow), (1, 401, 0.1)],
 )
 def test_a_tube_goes_to_its_end_whatever_the_units_and_the_spacing(scale, nodes, half):
     """All of the box is reached: no default tolerance is small beside spacing times slope."""
@@ -146,7 +148,9 @@ def test_a_guess_between_the_fixed_points_of_a_tube_is_refused(make):
         hjb.solve(make(0.5), GRID, guess=np.zeros(GRID.shape), scheme=hjb.Upwind())
 
 
-@pytest.mark.parametrize("inner", [hjb.ValueIteration(), hjb.PolicyIteration()], ids=repr)
+@pytest.mark.parametrize(
+    "inner", [hjb.ValueIteration(), pytest.param(hjb.PolicyIteration(), marks=pytest.mark.slow)], ids=repr
+)
 def test_coarser_grids_lead_to_no_other_fixed_point(inner):
     """From the interpolated answer of a coarser grid it came to another one, .0025 off, and said CONVERGED."""
     grid, actions = hjb.Grid([-1.0], [1.0], (41,)), hjb.Finite(np.array([[-1.0], [0.0], [1.0]]))

@@ -95,6 +95,7 @@ def around(x, u):
     return jnp.where(x > 0.5, jnp.sin(jnp.pi * x), u)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach")
 def test_a_drift_that_cancels_reaches_nothing():
     grid = hjb.Grid([0.0], [1.0], (11,))
@@ -129,6 +130,7 @@ def crawling(fast, x, u):
     return 0.0284 * u + jnp.where(x > 2.1, fast, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*cannot reach")
 @pytest.mark.parametrize("fast", [20.0, 2000.0])
 def test_a_slow_way_beside_a_fast_current(fast):

@@ -182,7 +182,7 @@ def test_certificates_hold_wherever_a_run_is_stopped(discount):
     assert np.max(np.abs(guessed.value - exact)) <= guessed.error + 1e-9 <= 2e-6
 
 
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("sign", [1, pytest.param(-1, marks=pytest.mark.slow)])
 def test_certificates_hold_where_nothing_is_held(sign):
     """Without a target every node may have a residual of one sign, and V_h lie on one side of V everywhere."""
     problem, grid = QUESTIONS["a plane, walls and a long stay"][0]()

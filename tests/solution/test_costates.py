@@ -38,6 +38,7 @@ def test_exact_for_quadratics(grid, numbers, a, b):
     np.testing.assert_allclose(got, wanted, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_second_order_on_a_smooth_value():
     def smooth(x):
         return np.sin(2 * x[..., 0]) * np.exp(0.5 * x[..., 1])

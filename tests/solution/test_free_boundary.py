@@ -59,7 +59,10 @@ def test_the_boundary_of_a_perpetual_put_is_found_within_a_fraction_of_a_cell(nu
     assert solution.active is None
 
 
-@pytest.mark.parametrize("count", [119, 163, 201])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "count", [119, pytest.param(163, marks=pytest.mark.slow), pytest.param(201, marks=pytest.mark.slow)]
+)
 def test_the_boundary_may_lie_anywhere_in_its_cell(count):
     put = Put()
     put.check(hjb.solve(put.problem(), put.grid(count)))
@@ -68,11 +71,11 @@ def test_the_boundary_may_lie_anywhere_in_its_cell(count):
 @pytest.mark.parametrize(
     "options",
     [
-        {"method": hjb.PolicyIteration(hjb.Direct())},
-        {"method": hjb.PolicyIteration(hjb.Krylov())},
+        pytest.param({"method": hjb.PolicyIteration(hjb.Direct())}, marks=pytest.mark.slow),
+        pytest.param({"method": hjb.PolicyIteration(hjb.Krylov())}, marks=pytest.mark.slow),
         {"method": hjb.ValueIteration()},
         {"scheme": hjb.Upwind()},
-        {"dtype": "float32", "tol": 0.05},
+        pytest.param({"dtype": "float32", "tol": 0.05}, marks=pytest.mark.slow),
     ],
     ids=str,
 )
@@ -184,7 +187,9 @@ def wait(price, **parts):
     return hjb.Problem(lambda x, u: 0 * x, lambda x, u: 1.0, discount=1.0, stopping_cost=price, **parts)
 
 
-@pytest.mark.parametrize("count", [62, 81, 90])
+@pytest.mark.parametrize(
+    "count", [pytest.param(62, marks=pytest.mark.slow), 81, pytest.param(90, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("radius", [0.6, 1.03, 1.37])
 def test_v_may_leave_the_price_at_an_angle(count, radius):
     solution = hjb.solve(wait(lambda x: (x[0] / radius) ** 2), hjb.Grid([-2.0], [2.0], (count,)))

@@ -274,7 +274,7 @@ def test_policies_are_called_as_in_reinforcement_learning():
     assert many.tolist() == [[2.0], [4.0]]
 
 
-@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("discrete", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_predict_is_control_at_for_every_kind_of_call(discrete):
     turned = dataclasses.replace(solution_of(lambda a, b: jnp.cos(a) + b, RING), discrete=discrete)
     x = np.array([[0.1, 0.5], [7.0, 9.0], [np.inf, 0.0], [np.nan, 0.0]])

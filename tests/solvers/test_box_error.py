@@ -71,6 +71,7 @@ def test_open_ends_assume_a_parabola():
     assert said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_linear_quadratic_problems_on_the_whole_space(n):
     """Next to the ends, where optimal paths leave the box, the estimate is the error; in the middle both are small."""
@@ -93,8 +94,9 @@ def test_linear_quadratic_problems_on_the_whole_space(n):
     assert np.max(solution.box_error[grid.inner(0.2)]) < 0.01 * np.ptp(solution.value)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings(f"ignore:{WARNED}")
-@pytest.mark.parametrize("time", [1e-6, 1e6])
+@pytest.mark.parametrize("time", [1e-6, pytest.param(1e6, marks=pytest.mark.slow)])
 def test_units(time):
     """Other units of time and cost change nothing but the units."""
     cost = 1e9

@@ -86,6 +86,7 @@ def test_nodes_without_a_value_set_no_slopes():
     np.testing.assert_allclose(solution.value[there], np.maximum(np.abs(x[there]) - 0.25, 0), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_single_solves():
     problems = [zoo.smooth(discount=beta, shape=(21, 21))[0] for beta in (0.5, 1.5)]
     grid = zoo.smooth(shape=(21, 21))[1]

@@ -1,5 +1,7 @@
 """Marching against exact answers, with fitted orders in space and in time; moving targets and obstacles."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,7 +106,12 @@ def test_riccati_with_noise():
 
 
 @pytest.mark.parametrize(
-    ("scheme", "order"), [(hjb.Upwind(), 1), pytest.param(hjb.Eno2(), 2, marks=pytest.mark.slow), (hjb.Weno5(), 5)]
+    ("scheme", "order"),
+    [
+        pytest.param(hjb.Upwind(), 1, marks=pytest.mark.slow),
+        pytest.param(hjb.Eno2(), 2, marks=pytest.mark.slow),
+        (hjb.Weno5(), 5),
+    ],
 )
 def test_a_wave_that_is_carried_along(scheme, order):
     """ẋ = 1 on a circle: V(x, 0) = ψ(x + T), with steps so short that the order is that of the slopes."""
@@ -234,6 +241,7 @@ def test_the_american_put():
 # --- implicit ---
 
 
+@pytest.mark.slow
 def test_implicit_steps_of_any_length_have_order_one_in_time():
     grid = line(41)
     limit = hjb.march(LQ, grid, 1.0, method=hjb.Explicit(3), scheme=hjb.Upwind(split=True)).value[0]
@@ -255,10 +263,18 @@ def test_implicit_games_agree_with_explicit_ones():
     assert np.max(np.abs(step - explicit)[inner(grid)]) < 0.01  # of first order in Δt
 
 
+QUICK = [(hjb.Explicit(), False, "upper"), (hjb.Explicit(), True, "lower"), (hjb.Implicit(), False, "lower")]
+REST = [
+    each
+    for each in itertools.product((hjb.Explicit(), hjb.Implicit()), (False, True), ("upper", "lower"))
+    if each not in QUICK
+]
+
+
 @pytest.mark.filterwarnings("ignore:.*the Isaacs condition fails", "ignore:the grid is coarse")
-@pytest.mark.parametrize("isaacs", ["upper", "lower"])
-@pytest.mark.parametrize("split", [False, True])
-@pytest.mark.parametrize("method", [hjb.Explicit(), hjb.Implicit()])
+@pytest.mark.parametrize(
+    ("method", "split", "isaacs"), [*QUICK, *(pytest.param(*each, marks=pytest.mark.slow) for each in REST)]
+)
 def test_policies_and_gap_are_those_of_the_hamiltonian_that_the_scheme_says(method, split, isaacs):
     """Players who meet in one component, upwinded by the sum of both drifts or each alone: by a table in NumPy."""
     us, ds = np.array([-1.0, 0.2, 1.0]), np.array([-0.7, 0.0, 0.7])

@@ -156,6 +156,7 @@ def test_times_and_what_they_hold(tmp_path):
     assert "times            3" in str(solution)
 
 
+@pytest.mark.slow
 def test_on_the_target_the_exit_cost_is_paid_and_nothing_is_done():
     problem = hjb.Problem(
         plane, lambda x, u: 1.0, Box([-1.0], [1.0]), target=lambda x: jnp.abs(x[0]) - 0.5, exit_cost=2.0

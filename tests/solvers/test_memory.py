@@ -67,7 +67,7 @@ def told_over_needed(problem, grid, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("noise", [None, 0.3])
+@pytest.mark.parametrize("noise", [pytest.param(None, marks=pytest.mark.slow), 0.3])
 @pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_estimate_is_what_the_compiled_loop_needs(n, noise, method):
     problem = hjb.Problem(
@@ -109,7 +109,7 @@ def test_the_largest_grid_with_modes_is_named_per_axis_of_the_state():
         assert (bytes_needed <= 10**9) == fits
 
 
-@pytest.mark.parametrize("method", METHODS[:2])
+@pytest.mark.parametrize("method", [METHODS[0], pytest.param(METHODS[1], marks=pytest.mark.slow)])
 def test_a_search_between_samples_is_counted(method):
     problem = hjb.Problem(lambda x, u: jnp.stack([x[1], jnp.sin(3 * u[0])]), cost, hjb.Box([-1.0], [1.0]), discount=1.0)
     assert 0.95 <= told_over_needed(problem, square(121), method) <= 1.4
@@ -274,7 +274,9 @@ def test_nobody_says_what_is_free(monkeypatch):
     assert memory.require(PROBLEM, square(30_000), METHODS[0], np.float64, None) == needed
 
 
-@pytest.mark.parametrize("method", [*METHODS[:2], pytest.param(METHODS[2], marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", [METHODS[0], *(pytest.param(method, marks=pytest.mark.slow) for method in METHODS[1:])]
+)
 def test_the_estimate_is_near_what_the_compiler_reports(method):
     """Between half and four times the peak of the compiled step."""
     import jax

@@ -53,7 +53,13 @@ PROBLEMS = {
 }
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in ("target", "undiscounted, at rest") else name
+        for name in PROBLEMS
+    ],
+)
 def test_what_is_known_of_every_second_node_is_what_a_preparation_finds_there(name):
     problem, grid = PROBLEMS[name]()
     task = task_of(problem, grid)

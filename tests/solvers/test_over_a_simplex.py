@@ -34,6 +34,7 @@ def merton(simplex):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "simplex", [hjb.Simplex(3), pytest.param(hjb.Simplex(2, at_most=True), marks=pytest.mark.slow)]
 )
@@ -172,6 +173,7 @@ def line_problem(total, n=2, gain=0.6):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @CARRIED
 @pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_derivatives_in_the_total(n):
@@ -215,6 +217,7 @@ def test_derivatives_of_searched_actions(n):
                 np.testing.assert_allclose(move, (plus - minus) / (2 * h), atol=atol, err_msg=name)
 
 
+@pytest.mark.slow
 @CARRIED
 def test_lanes_of_a_batch():
     grid, totals = hjb.Grid([-1.0], [1.0], (21,)), [0.5, 1.0, 2.0]

@@ -237,9 +237,10 @@ def test_lanes_with_enough_noise_keep_their_certificates():
     assert quiet.monotone_error <= 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "scheme"),
-    [(None, hjb.Limited(split=True)), (hjb.Implicit(), hjb.Upwind(split=True))],
+    [(None, hjb.Limited(split=True)), pytest.param(hjb.Implicit(), hjb.Upwind(split=True), marks=pytest.mark.slow)],
     ids=["explicit", "implicit"],
 )
 def test_marches(method, scheme):

@@ -159,7 +159,7 @@ def peak(lowered):
     return total - found.alias_size_in_bytes
 
 
-@pytest.mark.parametrize(("n", "count"), [(2, 400), (5, 8)])
+@pytest.mark.parametrize(("n", "count"), [(2, 400), pytest.param(5, 8, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "problem",
     [hjb.reach(ahead, U, disc), hjb.Problem(ahead, effort, U, discount=1.0)],
@@ -179,7 +179,7 @@ def test_a_solve_takes_twelve_bytes_a_node_beyond_the_value(n, count, problem):
 
 
 @pytest.mark.parametrize(("n", "count"), [(2, 400), pytest.param(5, 8, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("policy", [False, True])
+@pytest.mark.parametrize("policy", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Limited(), hjb.Weno5()], ids=lambda s: type(s).__name__)
 def test_a_march_takes_what_is_told_beforehand(n, count, policy, scheme):
     problem, grid, kind = hjb.reach(ahead, U, disc), box(n, count), np.dtype(np.float32)

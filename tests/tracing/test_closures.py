@@ -80,7 +80,9 @@ def no_cost(x, u):
 
 
 @pytest.mark.parametrize(
-    "again", [copy.deepcopy, lambda held: pickle.loads(pickle.dumps(held))], ids=["copy", "pickle"]
+    "again",
+    [pytest.param(copy.deepcopy, marks=pytest.mark.slow), lambda held: pickle.loads(pickle.dumps(held))],
+    ids=["copy", "pickle"],
 )
 def test_a_solution_goes_to_another_process(again):
     """With functions of a module, one of which reads a global; the copy is simulated and solved like the original."""

@@ -134,7 +134,7 @@ def fresh_warnings():
     interpreter._warn_once.cache_clear()
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 @pytest.mark.parametrize("name", COMPONENTS)
 def test_components_are_what_vmap_gives_without_a_warning(name, dtype):
     tolerance = 2e-5 if dtype == "float32" else 1e-12

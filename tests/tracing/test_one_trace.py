@@ -39,7 +39,10 @@ def box(dim):
 
 
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("dim", "noise"), [(1, 0.3), (2, None), pytest.param(2, 0.3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("dim", "noise"),
+    [(1, 0.3), pytest.param(2, None, marks=pytest.mark.slow), pytest.param(2, 0.3, marks=pytest.mark.slow)],
+)
 def test_a_solve_traces_the_drift_at_most_three_times(dim, noise, dtype):
     drift = Counted(pendulum)
     solution = hjb.solve(question(drift, controls=box(dim), noise=noise), GRID, dtype=dtype, scheme=hjb.Upwind())
@@ -47,7 +50,14 @@ def test_a_solve_traces_the_drift_at_most_three_times(dim, noise, dtype):
     assert 1 <= drift.calls <= TRACES
 
 
-@pytest.mark.parametrize("method", [hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct()), hjb.Nested()])
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(hjb.ValueIteration(), marks=pytest.mark.slow),
+        hjb.PolicyIteration(hjb.Direct()),
+        pytest.param(hjb.Nested(), marks=pytest.mark.slow),
+    ],
+)
 def test_so_does_a_solve_by_every_method(method):
     drift = Counted(pendulum)
     grid = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (81, 80)) if isinstance(method, hjb.Nested) else GRID
@@ -65,7 +75,7 @@ def test_so_does_a_game():
 
 
 @pytest.mark.parametrize("method", [None, pytest.param(hjb.Implicit(), marks=pytest.mark.slow)])
-@pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Weno5()])
+@pytest.mark.parametrize("scheme", [hjb.Upwind(), pytest.param(hjb.Weno5(), marks=pytest.mark.slow)])
 def test_so_does_a_march(scheme, method):
     if method is not None and not scheme.monotone:
         return

@@ -84,6 +84,7 @@ def test_a_round_that_pays_on_the_average():
     assert won.value.min() > 3.0 - 2.0 - 1e-6  # the best is to earn from π to 2π and to stop there
 
 
+@pytest.mark.slow
 def test_earning_on_a_way_that_ends():
     solution = hjb.solve(
         problem(move=uphill, cost=lambda rate, x, u: -rate, target=goal), GRID, tol=1e-6, scheme=hjb.Upwind()
@@ -97,6 +98,7 @@ def test_with_a_discount_it_is_finite():
     assert solution.value_at([1.0]) == pytest.approx(-2.0)
 
 
+@pytest.mark.slow
 def test_in_a_batch_only_the_lane_that_earns():
     def level(rate, x, u):
         return rate

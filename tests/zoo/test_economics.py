@@ -34,6 +34,7 @@ def test_consumption_is_proportional_to_the_capital(numbers):
     assert solution.stats["box_error"] == "no end of the box assumes anything"
 
 
+@pytest.mark.slow
 def test_capital_approaches_its_steady_state():
     problem, grid = zoo.growth(shape=(101,))
     path = hjb.simulate(problem, hjb.solve(problem, grid), [3.0], 60.0)
@@ -57,6 +58,7 @@ def test_share_and_rate_are_those_of_merton(name, numbers):
 PUTS = [{}, {"strike": 1.0, "interest": 0.03}, {"strike": 40.0, "interest": 0.08, "volatility": 0.45}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", PUTS)
 def test_a_perpetual_put(numbers):
     """The value to 1e-4 of the strike, the price of exercise to a tenth of a cell."""
@@ -136,6 +138,7 @@ def test_an_american_put_agrees_with_a_binomial_tree(numbers):
     assert early < 1e-4 * put.strike < 2e-4 * put.strike < late
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "numbers", [{}, {"payout": 0.0}, {"coupon": 3.0, "interest": 0.04, "volatility": 0.35, "payout": 0.03, "tax": 0.1}]
 )

@@ -51,6 +51,7 @@ def test_the_picture_of_the_moon_landing_coasts_and_burns_and_stands_on_the_grou
     assert path.times[-1] == path.reached == pytest.approx(float(ignition + burn), rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_burn_alone_ends_on_the_ground_with_the_least_fuel():
     lander = zoo.Lander()
     start = np.array([1.0, 0.0, 1.0])

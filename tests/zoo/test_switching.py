@@ -51,6 +51,7 @@ def implicit_scheme(wealth, aversion):
     return value, consumption, law
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("aversion", "count"), [(2.0, 100), pytest.param(1.5, 500, marks=pytest.mark.slow)], ids=["100", "500"]
 )

@@ -8,6 +8,7 @@ import numpy as np
 
 from hjbjax.extremals.boundary_value import BoundaryValueProblem
 from hjbjax.extremals.necessary_conditions import Extremal
+from hjbjax.problem.arguments import positive
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_partial
@@ -16,7 +17,7 @@ from hjbjax.problem.types import Array, Number
 from hjbjax.solution.solution import Solution
 
 
-def check_problem(problem: object, tol: float, max_nodes: int) -> None:
+def check_problem(problem: object, tol: float, max_nodes: int, time_limit: float | None) -> None:
     """Raise if the problem is not a deterministic optimal control problem, or if a limit is not admissible."""
     if not isinstance(problem, Problem):
         raise TypeError(f"pontryagin: got problem = {problem!r}, wanted a Problem")
@@ -55,6 +56,8 @@ def check_problem(problem: object, tol: float, max_nodes: int) -> None:
         raise ValueError(f"pontryagin: got tol = {tol!r}, wanted a number between 0 and 1")
     if isinstance(max_nodes, bool) or not isinstance(max_nodes, (int, np.integer)) or max_nodes < 1:
         raise ValueError(f"pontryagin: got max_nodes = {max_nodes!r}, wanted a positive integer")
+    if time_limit is not None:
+        positive(time_limit, "pontryagin: time_limit", "in seconds", endless=True)
 
 
 def check_guess(guess: object, n: int, horizon: object) -> None:

@@ -67,6 +67,7 @@ def pontryagin(
     grid: Grid | None = None,
     tol: float = 1e-8,
     max_nodes: int = 5000,
+    time_limit: float | None = None,
     throw: bool = True,
 ) -> Extremal:
     """Solve for the extremal from ``x0`` near an initial guess, in float64.
@@ -93,15 +94,16 @@ def pontryagin(
         Without ``guess`` and ``rest``, angles are brought to rest in both directions and the cheaper path is returned.
       tol: bound on the relative residual of the differential equations and of the conditions at the ends.
       max_nodes: maximal number of mesh nodes; the cost per iteration is proportional to the number of nodes.
+      time_limit: seconds, including compilation; one compilation or factorisation is not interrupted.
       throw: raise an error after a failure.
 
     Returns:
       An Extremal. With ``throw=False``, ``status`` and ``message`` report how a failed solve ended.
 
     Raises:
-      SolveError: the boundary-value problem was not solved; ``.solution`` is the last Extremal. After Ctrl-C it is the
-        last iterate, without controls. If Ctrl-C comes before the initial guess is ready, ``.solution`` is None and the
-        error is raised even with ``throw=False``.
+      SolveError: the boundary-value problem was not solved; ``.solution`` is the last Extremal. After Ctrl-C or the
+        time limit it is the last iterate, without controls. If either comes before the initial guess is ready,
+        ``.solution`` is None and the error is raised even with ``throw=False``.
       ValueError: an argument is not admissible.
       TypeError: a guess, a horizon or a terminal condition has the wrong type.
 
@@ -115,7 +117,7 @@ def pontryagin(
     """
     if is_traced(problem, x0, guess, terminal):
         raise ValueError("pontryagin: got traced values, but it runs on the host: call it outside jit, vmap and grad")
-    arguments.check_problem(problem, tol, max_nodes)
+    arguments.check_problem(problem, tol, max_nodes, time_limit)
     start = arguments.state_of_numbers(x0, "x0")
     arguments.check_guess(guess, len(start), horizon)
     problem, guess = costs_of(problem), _guess_in_costs(guess)
@@ -128,7 +130,7 @@ def pontryagin(
     problem = closures.settled(problem, len(start))
     if callable(terminal):
         terminal = closures.settled_function(terminal, (len(start),))
-    clock = Clock()
+    clock = Clock(seconds=time_limit)
     limits = Limits(tol, max_nodes, clock)
     # always float64: a residual of 1e-8 is below the rounding of float32
     with noting_interrupts(clock), own_settings(x64=True):

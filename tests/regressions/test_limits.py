@@ -753,6 +753,21 @@ def test_an_interrupted_extremal_is_the_last_iterate(slopes, problem, number):
     assert np.all(np.isnan(extremal.controls))
 
 
+def test_an_extremal_at_its_time_limit_is_the_last_iterate(monkeypatch):
+    inner, made = collocation._slopes, []
+    monkeypatch.setattr(Clock, "elapsed", lambda clock: 100.0 * bool(made))
+    monkeypatch.setattr(collocation, "_slopes", lambda *arguments: (made.append(1), inner(*arguments))[1])
+    with pytest.raises(hjb.SolveError, match="pontryagin: TIME_LIMIT: this is the last iterate") as caught:
+        hjb.pontryagin(LQ, [1.0], time_limit=50.0)
+    assert len(made) == 1
+    assert caught.value.solution.status is TIME_LIMIT
+    assert np.all(np.isfinite(caught.value.solution.costates))
+    extremal = hjb.pontryagin(LQ, [1.0], time_limit=101.0)
+    assert extremal.status is hjb.Status.CONVERGED
+    with pytest.raises(ValueError, match=r"pontryagin: time_limit = 0; wanted a finite number > 0, in seconds"):
+        hjb.pontryagin(LQ, [1.0], time_limit=0)
+
+
 def test_a_last_iterate_is_a_guess_to_go_on_from(slopes):
     options = {"horizon": 2.0, "terminal": [0.0]}
     slopes(2)

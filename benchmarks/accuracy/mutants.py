@@ -147,7 +147,7 @@ MUTANTS = (
         "iteration/time_methods.py",
         "3: Tableau((0.0, 3 / 4, 1 / 3))",
         "3: Tableau((0.0, 1 / 2, 1 / 2))",
-        ("tests/solvers/test_finite_horizon.py",),
+        ("tests/regressions/test_time_steps.py",),
     ),
     Mutant(
         "seam of an interpolation",

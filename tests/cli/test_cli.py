@@ -663,7 +663,7 @@ def test_output_that_cannot_be_written(words):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a disk that is full")
-@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("unbuffered", ["", pytest.param("1", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("words", "code"), [(["list"], 5), (["lst"], 2)])
 def test_nobody_hears_the_refusal(words, code, unbuffered):
     command = [sys.executable, "-m", "hjbjax", *words]

@@ -73,7 +73,7 @@ def quadratic(x):
     return x @ jnp.array([[2.0, 0.5], [0.5, 1.0]]) @ x
 
 
-@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("noisy", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_it_is_the_minimiser_of_a_game_also_where_the_control_drives_the_noise(noisy):
     """V quadratic, so that the differences are exact; u minimises 2u² − .3u + uV₁ + ½σ²(u)V₁₁, and d maximises."""
     grid, x = Grid([-1.0, -1.0], [1.0, 1.0], (11, 11)), np.array([0.23, -0.41])

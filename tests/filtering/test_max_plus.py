@@ -11,7 +11,7 @@ from hjbjax.filtering import sup_pairing
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @settings(max_examples=25)
 def test_maxima_of_quadratics_are_exact(n, seed):

@@ -101,12 +101,17 @@ def check_minimum(problem, grid, value, scan, scheme):
     return u
 
 
-@pytest.mark.parametrize("scheme", SCHEMES, ids=["plain", "central"])
 @pytest.mark.parametrize(
-    ("cost", "kind"),
+    ("cost", "kind", "scheme"),
     [
-        ("cost", "none"), ("cost", "matrix"), ("affine_cost", "none"),
-        pytest.param("affine_cost", "matrix", marks=pytest.mark.slow),
+        ("cost", "none", SCHEMES[1]), ("cost", "matrix", SCHEMES[0]), ("affine_cost", "none", SCHEMES[0]),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in [
+                ("cost", "none", SCHEMES[0]), ("cost", "matrix", SCHEMES[1]), ("affine_cost", "none", SCHEMES[1]),
+                *(("affine_cost", "matrix", scheme) for scheme in SCHEMES),
+            ]
+        ),
     ],
 )  # fmt: skip
 @given(seed=SEEDS)

@@ -85,7 +85,9 @@ def test_slabs_equal_a_loop_over_the_nodes(shape, periodic, rounds, monkeypatch)
     assert not np.allclose(found, in_turns, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("cache", [gauss_seidel.CACHE, 2**11])  # the second is less than all takes, and a slab fits
+@pytest.mark.parametrize(
+    "cache", [pytest.param(gauss_seidel.CACHE, marks=pytest.mark.slow), 2**11]
+)  # the second is less than all takes, and a slab fits
 def test_one_signed_weight_does_for_two_of_which_one_is_zero(cache, monkeypatch):
     grid = make_grid(3, (True, False, True))
     monkeypatch.setattr(gauss_seidel, "SLAB", 1)

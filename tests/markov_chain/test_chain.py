@@ -132,7 +132,13 @@ def test_generator_equals_its_formula(n, kind, central, seed):
 
 
 @pytest.mark.parametrize(
-    ("n", "kind"), [(1, "scalar"), (2, "matrix"), (2, "diagonal"), pytest.param(3, "matrix", marks=pytest.mark.slow)]
+    ("n", "kind"),
+    [
+        (1, "scalar"),
+        (2, "matrix"),
+        pytest.param(2, "diagonal", marks=pytest.mark.slow),
+        pytest.param(3, "matrix", marks=pytest.mark.slow),
+    ],
 )
 @given(seed=SEEDS)
 @settings(max_examples=6)

@@ -233,7 +233,7 @@ def test_modes_are_the_first_axis_of_a_law(find, lose):
     assert law.sum(axis=0) @ np.asarray(grid.axis(0)) == pytest.approx(share - 2 * (1 - share), abs=0.05)
 
 
-@pytest.mark.parametrize("timed", [False, True])
+@pytest.mark.parametrize("timed", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_laws_inside_programs(timed):
     grid, times = hjb.Grid([-2.0], [2.0], (13,)), np.array([0.0, 0.5, 1.0])
     x, start = np.asarray(grid.axis(0)), np.eye(13)[4]

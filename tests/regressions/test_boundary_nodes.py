@@ -122,7 +122,7 @@ def test_an_exit_cost_behind_the_seam_is_that_before_it():
     assert np.allclose(plain, wrapped, atol=1e-9)
 
 
-@pytest.mark.parametrize("far", [1e12, 1e20])
+@pytest.mark.parametrize("far", [pytest.param(1e12, marks=pytest.mark.slow), 1e20])
 def test_a_jump_of_the_level_holds_no_node_beside_it(far):
     def level(x):
         return jnp.where(x[0] > 1.05, far, x[0] - 0.05)

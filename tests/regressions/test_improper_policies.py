@@ -45,7 +45,9 @@ def by_value_iteration():
     return value
 
 
-@pytest.mark.parametrize("method", [None, hjb.PolicyIteration(hjb.Direct()), hjb.ValueIteration()])
+@pytest.mark.parametrize(
+    "method", [None, hjb.PolicyIteration(hjb.Direct()), pytest.param(hjb.ValueIteration(), marks=pytest.mark.slow)]
+)
 def test_every_method_comes_to_the_value(method):
     solution = hjb.solve(question(), GRID, method=method, tol=1e-3, scheme=hjb.Upwind())
     exact = by_value_iteration()

@@ -49,7 +49,9 @@ def between(x, u):
     return jnp.where((jnp.abs(u[0] + 0.613) < 0.1) & (x[0] > 0.3), jnp.nan, (u[0] + 0.613) ** 2)
 
 
-@pytest.mark.parametrize("method", [None, hjb.ValueIteration(), hjb.ValueIteration(policy=False)])
+@pytest.mark.parametrize(
+    "method", [None, hjb.ValueIteration(), pytest.param(hjb.ValueIteration(policy=False), marks=pytest.mark.slow)]
+)
 def test_a_nan_on_the_way_is_placed(method):
     solution = hjb.solve(problem(cost=between), GRID, method=method, throw=False, scheme=hjb.Upwind())
     assert solution.status is Status.NONFINITE

@@ -22,7 +22,7 @@ def solution_of(function, grid, **fields):
     return Solution(grid, value, np.zeros((*value.shape, 1)), code=1, **fields)
 
 
-@pytest.mark.parametrize("grid", [PLAIN, STRETCHED], ids=["plain", "stretched"])
+@pytest.mark.parametrize("grid", [pytest.param(PLAIN, marks=pytest.mark.slow), STRETCHED], ids=["plain", "stretched"])
 @given(st.tuples(*[NUMBERS] * 5), st.floats(-1, 1), st.floats(0, 3))
 def test_exact_for_quadratics(grid, numbers, a, b):
     """A product of two coordinates too; to the ends of the box, where parabolas take over."""

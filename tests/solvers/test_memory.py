@@ -66,7 +66,9 @@ def told_over_needed(problem, grid, method):
     return memory.peak_bytes(problem, grid, method, np.float64) / (together - found.alias_size_in_bytes)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [*(pytest.param(method, marks=pytest.mark.slow) for method in METHODS[:2]), METHODS[2]]
+)
 @pytest.mark.parametrize("noise", [pytest.param(None, marks=pytest.mark.slow), 0.3])
 @pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_estimate_is_what_the_compiled_loop_needs(n, noise, method):

@@ -180,7 +180,11 @@ def test_a_solve_takes_twelve_bytes_a_node_beyond_the_value(n, count, problem):
 
 @pytest.mark.parametrize(("n", "count"), [(2, 400), pytest.param(5, 8, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("policy", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("scheme", [hjb.Upwind(), hjb.Limited(), hjb.Weno5()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "scheme",
+    [hjb.Upwind(), pytest.param(hjb.Limited(), marks=pytest.mark.slow), hjb.Weno5()],
+    ids=lambda s: type(s).__name__,
+)
 def test_a_march_takes_what_is_told_beforehand(n, count, policy, scheme):
     problem, grid, kind = hjb.reach(ahead, U, disc), box(n, count), np.dtype(np.float32)
     with jax.enable_x64(False):

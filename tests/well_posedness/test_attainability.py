@@ -185,7 +185,7 @@ def priced(x, u):
     return u[0] * u[0]
 
 
-@pytest.mark.parametrize("dearest", [None, 0.0])
+@pytest.mark.parametrize("dearest", [pytest.param(None, marks=pytest.mark.slow), 0.0])
 def test_a_refuge_is_the_largest_set_that_an_action_keeps_to(dearest):
     """On a line with random moves, against the definition; dear actions do not count."""
     rng = np.random.default_rng(3)

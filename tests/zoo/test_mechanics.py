@@ -46,7 +46,9 @@ def test_the_pendulum_is_quadratic_near_upright(parameters):
     assert far / near == pytest.approx(16, rel=0.02)
 
 
-@pytest.mark.parametrize("links", [1, 2, 3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "links", [1, 2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)]
+)
 def test_the_mass_matrix_is_symmetric_and_positive(links):
     rng = np.random.default_rng(links)
     arm = zoo.Manipulator(links=links, lengths=rng.uniform(0.5, 2, links), masses=rng.uniform(0.5, 2, links))
@@ -66,7 +68,9 @@ def test_the_mass_matrix_is_symmetric_and_positive(links):
     np.testing.assert_array_equal(rates[:links], w)
 
 
-@pytest.mark.parametrize("links", [1, 2, 3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "links", [1, 2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)]
+)
 def test_power_is_torque_times_velocity(links):
     rng = np.random.default_rng(10 + links)
     arm = zoo.Manipulator(links=links, masses=rng.uniform(0.5, 2, links))
@@ -75,7 +79,9 @@ def test_power_is_torque_times_velocity(links):
     assert float(power) == pytest.approx(float(x[links:] @ tau), rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("links", [1, 2, 3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "links", [1, 2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)]
+)
 def test_the_coriolis_matrix_makes_the_rate_of_the_masses_skew(links):
     rng = np.random.default_rng(20 + links)
     arm = zoo.Manipulator(links=links, lengths=rng.uniform(0.5, 2, links), masses=rng.uniform(0.5, 2, links))
@@ -91,7 +97,9 @@ def test_the_coriolis_matrix_makes_the_rate_of_the_masses_skew(links):
     np.testing.assert_allclose(skew, -skew.T, atol=1e-9)
 
 
-@pytest.mark.parametrize("links", [1, 2, 3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "links", [1, 2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)]
+)
 def test_computed_torque_gives_the_acceleration_asked_for(links):
     rng = np.random.default_rng(30 + links)
     arm = zoo.Manipulator(links=links, lengths=rng.uniform(0.5, 2, links), masses=rng.uniform(0.5, 2, links))
@@ -155,7 +163,9 @@ def test_two_links_are_the_textbook_arm(q1, q2, w1, w2):
     np.testing.assert_allclose(arm.gravity(q), [fold - (m1 + m2) * l1 * g * np.sin(q1), fold], atol=1e-10)
 
 
-@pytest.mark.parametrize("links", [1, 2, 3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "links", [1, 2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)]
+)
 def test_energy_is_conserved_without_torque(links):
     arm = zoo.Manipulator(links=links)
     drift = jax.jit(arm.drift)

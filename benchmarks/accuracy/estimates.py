@@ -24,7 +24,6 @@ from hjbjax.applications.reference import at_nodes_of, mask_of
 COLUMNS = ("kind", "problem", "shape", "error", "range", "estimate", "ratio", "warned", "verdict", "status")
 LEAST, MOST = 1 / 3, 5.0  # ratios outside are "too small" and "too large"
 SMALL = 1e-3  # of the range of V: smaller errors do not count
-TOL = 1e-6
 MISSING = "not estimated"  # beginning of the reason for a missing estimate
 
 
@@ -32,7 +31,7 @@ def row_of(solution: hjb.Solution, exact: np.ndarray, mask: np.ndarray, warned: 
     """The entries of one answer in the table; ``exact`` and ``mask`` have the shape (*grid)."""
     value = np.asarray(solution.value) if solution.times is None else np.asarray(solution.value)[0]
     true, known = np.abs(value - exact)[mask], exact[mask]
-    parts = [0.0 if solution.error is None else min(solution.error, TOL)]
+    parts = [0.0 if solution.error is None else min(solution.error, solution.stats["tol"])]
     silent = solution.status is not hjb.Status.CONVERGED
     for name in ("grid_error",) if walls else ("grid_error", "box_error"):
         found = getattr(solution, name)
@@ -59,7 +58,7 @@ def of_known(case: Known) -> dict[str, Any]:
     mask = np.ones(len(states), bool) if case.region is None else case.region(states)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        solution = case.solved(TOL)
+        solution = case.solved()
     return row_of(solution, exact, mask.reshape(case.grid.shape), bool(caught), case.walls)
 
 
@@ -68,7 +67,7 @@ def of_zoo(problem: hjb.Problem, grid: hjb.Grid, exact: Any, region: Any) -> dic
     mask = mask_of(region, grid)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        solution = hjb.solve(problem, grid, tol=TOL, throw=False)
+        solution = hjb.solve(problem, grid, throw=False)
     return row_of(solution, at_nodes_of(exact, grid, mask), mask, bool(caught), False)
 
 
@@ -134,7 +133,7 @@ def command(quick: bool, out: Path) -> None:
     rows = []
     for row in measured(quick):
         jax.clear_caches()  # a process cannot map the programs of all problems at once
-        rows.append({"benchmark": "estimates", "dtype": "float64", "tol": TOL, **row})
+        rows.append({"benchmark": "estimates", "dtype": "float64", **row})
         click.echo(table(rows[-1:], COLUMNS).splitlines()[-1])
     click.echo(table(rows, COLUMNS))
     click.echo(table(summary(rows), ("kind", "rows", "silent", "count", "too small", "least", "median", "most")))

@@ -42,10 +42,10 @@ class Known:
     walls: bool = False
     horizon: float | None = None
 
-    def solved(self, tol: float) -> hjb.Solution:
+    def solved(self) -> hjb.Solution:
         """The answer of the default solver."""
         if self.horizon is None:
-            return hjb.solve(self.problem, self.grid, tol=tol, throw=False)
+            return hjb.solve(self.problem, self.grid, throw=False)
         return hjb.march(self.problem, self.grid, self.horizon, throw=False)
 
 

@@ -63,9 +63,23 @@ class Figures:
             pyplot.close("all")
 
 
+class Examples:
+    """Doctests that solve or simulate several problems are slow tests."""
+
+    # the folders of `hjbjax` whose examples take two minutes in all; the tests of these folders cover the same calls
+    LONG = frozenset({"applications", "extremals", "feedback", "filtering", "geometry"})
+
+    @classmethod
+    def pytest_itemcollected(cls, item):
+        """Mark the examples of these folders."""
+        if isinstance(item, pytest.DoctestItem) and item.path.parent.name in cls.LONG:
+            item.add_marker("slow")
+
+
 def pytest_configure(config):
     """Doctests lie outside of this folder, whose own hooks they do not see."""
-    config.pluginmanager.register(Figures())
+    for plugin in (Figures(), Examples()):
+        config.pluginmanager.register(plugin)
 
 
 def pytest_addoption(parser):

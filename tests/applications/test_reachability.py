@@ -61,6 +61,7 @@ def push(x, u, d):
     return u + 0.5 * d
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("player", ["with", pytest.param("without", marks=pytest.mark.slow)])
 def test_an_opponent_slows_the_tube_down(player):
     """|x| ≤ ½ + (1 − ½)T against a disturbance of half the strength, ½ + T without one."""

@@ -327,6 +327,7 @@ def minus_utility(x, u):
     return -(u[0] ** (1 - CAPITAL_SHARE)) / (1 - CAPITAL_SHARE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most", [pytest.param(2.0, marks=pytest.mark.slow), 20.0, 200.0])
 def test_growth_with_constrained_ends(most):
     """With γ = a the optimal consumption is k(ρ + (1 − a)δ)/a; projected ends give any c up to its bound."""

@@ -95,6 +95,7 @@ def test_what_is_out_of_reach_stays_out_of_reach():
     assert geometry.reachability_distribution(*alone, np.zeros(4), 3).rank == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("units", [[1.0, 1.0, 1.0], [1e6, 1e-3, 1e-7]])
 def test_brocketts_integrator_needs_one_bracket_in_any_units(units):
     units = np.array(units)

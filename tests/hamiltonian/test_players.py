@@ -38,7 +38,9 @@ def plain():
 @pytest.mark.parametrize(
     ("drift", "cost", "controls"),
     [
-        (lambda x, u: jax.lax.stop_gradient(u), lambda x, u: x @ x + 0.1 * u @ u, UNIT),
+        pytest.param(
+            lambda x, u: jax.lax.stop_gradient(u), lambda x, u: x @ x + 0.1 * u @ u, UNIT, marks=pytest.mark.slow
+        ),
         pytest.param(lambda x, u: timid(u), lambda x, u: x @ x + 0.1 * u @ u, UNIT, marks=pytest.mark.slow),
         pytest.param(
             lambda x, u: u, lambda x, u: x @ x + 0.1 * timid(u) @ jax.lax.stop_gradient(u), UNIT, marks=pytest.mark.slow

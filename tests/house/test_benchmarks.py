@@ -150,6 +150,7 @@ def test_a_sweep_is_compared_with_the_peer_before_it_is_timed(monkeypatch):
         sweep.largest_difference(problem, grid, points)
 
 
+@pytest.mark.slow
 def test_sweep_kernels_compute_what_a_step_of_value_iteration_does():
     problem, grid = cases.pendulum(16, 5)
     calls = sweep.candidates(problem, grid, 3)

@@ -82,6 +82,7 @@ def test_it_knows_no_unit_of_time(unit):
     np.testing.assert_allclose(found, known, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_noise_goes_with_one_player():
     scheme = hjb.Upwind(central=False, split=True)
     solution = hjb.solve(game(noise=0.4), GRID, scheme=scheme, tol=1e-9)

@@ -73,6 +73,7 @@ def test_a_rotation_keeps_mass_sign_and_width():
     np.testing.assert_allclose(np.diag(covariance), 0.04, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_the_order_of_transport_is_the_second():
     """x' = 1 + sin(x)/2 on a ring: the mass between two paths does not change."""
     errors = []

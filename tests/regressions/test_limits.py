@@ -840,6 +840,7 @@ def test_how_long_a_chunk_of_a_simulation_is_changes_no_bit(monkeypatch, target)
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_ctrl_c_after_the_last_chunk_of_a_simulation_is_not_lost(monkeypatch):
     plain = hjb.Problem(drift, cost, hjb.Box([-9.0], [9.0]))
     made = pressing(monkeypatch, 10**6)

@@ -31,7 +31,7 @@ def assert_certified(found, exact, seed):
     assert np.all(exact <= upper + slack), seed
 
 
-QUICK = ("both", "rates that the control steers")
+QUICK = ("both",)
 
 
 @pytest.mark.parametrize(
@@ -130,6 +130,7 @@ def test_derivatives_are_those_of_differences(scheme):
     assert np.allclose(backward, forward, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [hjb.Explicit(), pytest.param(hjb.Implicit(), marks=pytest.mark.slow)], ids=["explicit", "implicit"]
 )

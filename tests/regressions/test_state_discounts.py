@@ -198,6 +198,7 @@ def test_a_path_is_discounted_by_the_integral_along_it(rewards):
     assert hjb.simulate(alone, None, [1.0], 3.0).cost == pytest.approx(exact, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_the_chain_counts_its_own_time_so_one_factor_serves_all_states():
     actions = hjb.Finite([[-1.0], [0.0], [1.0]])
     problem = hjb.Problem(steer, paid, actions, noise=0.4, discount=mortal)

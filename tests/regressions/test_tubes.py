@@ -148,6 +148,7 @@ def test_a_guess_between_the_fixed_points_of_a_tube_is_refused(make):
         hjb.solve(make(0.5), GRID, guess=np.zeros(GRID.shape), scheme=hjb.Upwind())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "inner", [hjb.ValueIteration(), pytest.param(hjb.PolicyIteration(), marks=pytest.mark.slow)], ids=repr
 )
@@ -214,6 +215,7 @@ def test_reach_tube_of_the_floating_boat():
     np.testing.assert_allclose(solution.value[past], (y - 1)[past], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_avoid_tube_of_the_floating_boat():
     """The supremum over time of −l: the smallest solution, reached from g; from zero nothing would be safe."""
     problem = hjb.Problem(along, controls=hjb.Box([-1.0], [1.0]), running_max=minus_block)

@@ -66,6 +66,7 @@ def test_numbers_of_64_bits_in_a_closure_may_be_traced_in_a_solve_of_32(transfor
     assert short == pytest.approx(long, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_program_of_32_bits_returns_the_grid_that_it_solves_on():
     """JAX passed its float32 copy of the grid's corners, a part of the solution, to float64 programs of the host."""
     grid = hjb.Grid([0.0], [1.0], (21,), edges=(("projected", hjb.Dirichlet(3.0)),))

@@ -319,6 +319,7 @@ def test_a_march_inside_a_program_has_the_sets_of_a_march_outside():
     assert lanes.stopping[1].sum() > lanes.stopping[0].sum()
 
 
+@pytest.mark.slow
 def test_a_march_that_is_resumed_keeps_its_sets(tmp_path):
     file = tmp_path / "march.ckpt"
     first = hjb.march(option(1.0), LINE, 0.5, times=TIMES, checkpoint=file)
@@ -330,8 +331,10 @@ def test_a_march_that_is_resumed_keeps_its_sets(tmp_path):
     assert bare.stopping is None
 
 
-@pytest.mark.parametrize("volatilities", [pytest.param((0.3, 0.3), marks=pytest.mark.slow), (0.2, 0.4)])
-def test_every_mode_has_its_own_boundary(volatilities):
+@pytest.mark.parametrize(
+    ("volatilities", "scheme"), [((0.2, 0.4), hjb.Upwind()), slow((0.2, 0.4), None), slow((0.3, 0.3), None)]
+)
+def test_every_mode_has_its_own_boundary(volatilities, scheme):
     """With the same volatility in both modes it is that of one put, else between the boundaries of two puts."""
     grid, table = Put().grid(101), np.array(volatilities)
 
@@ -341,7 +344,7 @@ def test_every_mode_has_its_own_boundary(volatilities):
             stopping_reward=lambda x, mode: jnp.maximum(100.0 - x[0], 0.0), target=lambda x, mode: 399.99 - x[0],
             exit_reward=0.0, modes=hjb.Modes(("calm", "wild"), rates),
         )  # fmt: skip
-        solution = hjb.solve(put, grid)
+        solution = hjb.solve(put, grid, scheme=scheme)
         assert solution.stopping.shape == (2, 101)
         with pytest.raises(ValueError, match=r"Write solution.in_mode\('calm'\).free_boundary"):
             solution.free_boundary()

@@ -59,6 +59,7 @@ def test_drift_that_is_cut():
     assert not said
 
 
+@pytest.mark.slow
 def test_open_ends_assume_a_parabola():
     """V = e^y/0.04 is no parabola: the answer is 26 % off at the upper end, on every grid."""
     problem = hjb.Problem(lambda y, u: 0 * y - 0.01125, lambda y, u: jnp.exp(y[0]), noise=0.25, discount=0.06)

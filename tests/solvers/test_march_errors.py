@@ -102,7 +102,7 @@ WAYS = {
     "four stages": {"method": hjb.Explicit(4)},
     "implicit": {"method": hjb.Implicit()},
 }
-QUICK = [("Riccati", "default"), ("tube", "default"), ("jump", "default")]
+QUICK = [("Riccati", "default"), ("tube", "default")]
 # The estimate is too small at 7 % of the nodes where implicit steps smear a jump, and at a third where Euler's steps
 # sharpen a kink: they are anti-diffusive with slopes of second order.
 OPEN = [("jump", "implicit"), ("tube", "euler")]

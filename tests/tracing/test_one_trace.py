@@ -65,6 +65,7 @@ def test_so_does_a_solve_by_every_method(method):
     assert drift.calls <= TRACES
 
 
+@pytest.mark.slow
 def test_so_does_a_game():
     drift = Counted(lambda x, u, d: jnp.stack([x[1] + d[0], u[0] - x[0]]))
     problem = hjb.Problem(

@@ -264,17 +264,17 @@ def test_a_bound_that_is_felt_is_infeasible():
     assert len(str(e.value).splitlines()) <= 6
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("scheme", [hjb.Upwind(split=True), pytest.param(hjb.Weno5(), marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore:the grid is coarse")
-def test_a_march_goes_on_from_another():
+def test_a_march_goes_on_from_another(scheme):
     problem, grid = LAG.game()(0.9), cube(1, 21)
-    options = {"scheme": hjb.Weno5(), "step": 1 / 256}
+    options = {"scheme": scheme, "step": 1 / 256}
     whole = hjb.march(problem, grid, 2.0, **options)
     half = hjb.march(problem, grid, 1.0, **options)
     rest = hjb.march(problem, grid, 1.0, start=half.value[0], **options)
     np.testing.assert_allclose(rest.value[0], whole.value[0], rtol=0, atol=1e-12)
     with pytest.raises(ValueError, match=r"march: start has shape \(3,\), the grid \(21,\)"):
-        hjb.march(problem, grid, 1.0, start=np.zeros(3), scheme=hjb.Upwind(split=True))
+        hjb.march(problem, grid, 1.0, start=np.zeros(3), scheme=scheme)
 
 
 @pytest.mark.parametrize(

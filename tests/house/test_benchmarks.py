@@ -382,7 +382,6 @@ def test_a_bug_whose_place_is_gone_is_refused(text):
         stale.applied(text)
 
 
-@pytest.mark.slow
 def test_what_cannot_be_imported_is_no_verdict(tmp_path):
     (tmp_path / "test_it.py").write_text("import there_is_no_such_module\n")
     with pytest.raises(RuntimeError, match="pytest ended with 2"):

@@ -25,7 +25,7 @@ from hjbjax.hamiltonian import pointwise
 from hjbjax.hamiltonian.pointwise import Rule
 from hjbjax.neural import ingredients, riccati
 from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz, norm_of, terminal_cost
-from hjbjax.neural.extremal_samples import ExtremalSamples
+from hjbjax.neural.extremal_samples import TOL, ExtremalSamples
 from hjbjax.neural.network import checked_layers, initial_weights
 from hjbjax.neural.solution import NeuralSolution, value_of, weights_of_guess
 from hjbjax.neural.training import CHUNK, Training, train
@@ -41,6 +41,7 @@ from hjbjax.solution.status import Status
 NAME = "neural.solve"
 FLOOR = 0.01  # of the mean size of the terms: below it a residual counts relative to this size
 HELD_OUT, FRESH = 1024, 4 * 1024  # states that choose the best weights, and states of the final residual
+CHOOSING = 4  # held-out extremals, at most, that choose the best weights; the others only validate
 CANDIDATES = 64  # random states per extremal; the one with the largest residual is its start
 ROUNDS = 4  # in which the extremals are computed, half of them before the training
 WARM = 0.25  # of the steps, over which the weight of the residual grows from zero to one
@@ -131,7 +132,8 @@ def solve(
         training may then end at another solution of the equation, such as a negative one. Over a horizon this solution
         belongs to the middle of the box, and is left out if its Riccati equation has none.
       extremals: number of extremals for the training; 0 trains on the residual of the equation only.
-      held_out: number of further extremals for the validation.
+      held_out: number of further extremals. At most 4 of them, and at most half, choose the best weights, together with
+        the residual; the others are for the validation.
       steps: steps of the optimiser.
       batch: random states per step.
       layers: widths of the hidden layers.
@@ -176,14 +178,18 @@ def solve(
         if guess is not None:
             begun = weights_of_guess(guess, np.shape(ansatz.weights[0][0])[0], widths, NAME)
             ansatz = dataclasses.replace(ansatz, weights=begun)
-        seen, unseen = (ExtremalSamples(*corners, count, options) for count in (extremals, held_out))
-        unseen.collect(settled, draw.uniform(*corners, (2 * held_out, n)), clock)
-        found = _trained(equation, ansatz, seen, counts, rate, seed, clock)
+        choosing = min(CHOOSING, held_out // 2)
+        sizes = (extremals, choosing, held_out - choosing)
+        seen, chosen, unseen = (ExtremalSamples(*corners, size, options) for size in sizes)
+        for held in (unseen, chosen):
+            held.collect(settled, draw.uniform(*corners, (2 * held.capacity, n)), clock)
+        found = _trained(equation, ansatz, (seen, chosen), counts, rate, seed, clock)
         if found.status in CUT and not found.history:
             raise SolveError(f"{NAME}: {found.status}, before the training began")
         ansatz = jax.tree.map(np.asarray, dataclasses.replace(ansatz, weights=found.weights))
         solution = NeuralSolution(ansatz, *corners, settled, rule)
-        validation = _validation(equation, solution, unseen, seed) | {"failed": float(seen.failed + unseen.failed)}
+        failed = {"failed": float(seen.failed + chosen.failed + unseen.failed)}
+        validation = _validation(equation, solution, unseen, seed) | failed
         status = found.status
         if status in (Status.MAX_STEPS, Status.CONVERGED):
             judged = ("value_error", "excess_cost") if unseen.starts else ("residual",)
@@ -250,18 +256,58 @@ def _relative_residuals(equation: Equation, ansatz: Any, places: tuple[Array, Ar
     return residuals / (sizes + float(equation.floor))
 
 
+def _loss(equation: Equation, ansatz: Any, key: Key, data: Any, least: float, batch: int) -> jax.Array:
+    """The mean square of the residual at random states and of the errors along extremals.
+
+    Args:
+      equation: the equation.
+      ansatz: the value.
+      key: of the states and of the points of extremals.
+      data: points of extremals, and the weights of both parts.
+      least: the size of values below which errors are not relative, cost units.
+      batch: the number of random states.
+    """
+    of_states, of_points = jax.random.split(key)
+    size = (equation.hi - equation.lo) / 2
+    rows = jax.random.randint(of_points, (POINTS,), 0, data["count"])
+
+    def misfit(t: Number, x: State, value: Number, costate: State) -> jax.Array:
+        found, p = jax.value_and_grad(ansatz, 2)(equation.problem, t, x)
+        scale = jnp.abs(value) + least
+        return ((found - value) / scale) ** 2 + jnp.mean(((p - costate) * size / scale) ** 2)
+
+    apart = jax.vmap(misfit)(*(data[name][rows] for name in ("times", "states", "values", "costates")))
+    places = equation.places(of_states, batch)
+    residuals = jax.vmap(lambda t, x: equation.relative_residual(ansatz, t, x))(*places)
+    return data["share"] * jnp.mean(residuals**2) + data["weight"] * jnp.mean(apart)
+
+
+def _held_out_error(equation: Equation, ansatz: Any, places: tuple[Array, Array], chosen: ExtremalSamples) -> float:
+    """The root of the sum of the squares of the relative residual and of the error of V along held-out extremals.
+
+    The equation has several solutions, so the residual does not show a wrong one.
+    """
+    residual = np.sqrt(np.mean(_relative_residuals(equation, ansatz, places) ** 2))
+    if not chosen.count:
+        return float(residual)
+    rows = slice(0, chosen.count)
+    _, _, found = _terms_at(equation, ansatz, (chosen.times[rows], chosen.states[rows]))
+    # the extremals themselves are exact to about TOL
+    apart = max(_relative(found - chosen.values[rows], chosen.values[rows]) - TOL, 0.0)
+    return float(np.hypot(residual, apart))
+
+
 def _trained(
     equation: Equation,
     ansatz: Any,
-    seen: ExtremalSamples,
+    samples: tuple[ExtremalSamples, ExtremalSamples],
     counts: Sequence[int],
     rate: float,
     seed: int,
     clock: Clock,
 ) -> Training:
     """The training on the residual and on extremals, some of which are added on the way."""
-    steps, batch = counts
-    size = (equation.hi - equation.lo) / 2
+    (seen, chosen), (steps, batch) = samples, counts
     pure = isinstance(ansatz, RestAnsatz) and not ansatz.quadratic
     _, _, values = _terms_at(equation, ansatz, equation.places(jax.random.key(0), HELD_OUT))
     # without its quadratic part the initial value may be zero everywhere; the mean of |y|² is as large as the exact one
@@ -271,24 +317,13 @@ def _trained(
     def of(weights: Any) -> Any:
         return dataclasses.replace(ansatz, weights=weights)
 
-    def misfit(weights: Any, t: Any, x: Any, value: Any, costate: Any) -> jax.Array:
-        found, p = jax.value_and_grad(of(weights), 2)(equation.problem, t, x)
-        scale = jnp.abs(value) + least
-        return ((found - value) / scale) ** 2 + jnp.mean(((p - costate) * size / scale) ** 2)
-
     def loss(weights: Any, key: Key, data: Any) -> jax.Array:
-        of_states, of_points = jax.random.split(key)
-        rows = jax.random.randint(of_points, (POINTS,), 0, data["count"])
-        points = (data[name][rows] for name in ("times", "states", "values", "costates"))
-        apart = jax.vmap(lambda *point: misfit(weights, *point))(*points)
-        places = equation.places(of_states, batch)
-        residuals = jax.vmap(lambda t, x: equation.relative_residual(of(weights), t, x))(*places)
-        return data["share"] * jnp.mean(residuals**2) + data["weight"] * jnp.mean(apart)
+        return _loss(equation, of(weights), key, data, least, batch)
 
     held_out = equation.places(jax.random.key(seed + 1), HELD_OUT)
 
     def measure(weights: Any) -> float:
-        return float(np.sqrt(np.mean(_relative_residuals(equation, of(weights), held_out) ** 2)))
+        return _held_out_error(equation, of(weights), held_out, chosen)
 
     chunks = -(-steps // CHUNK)
     rounds = {chunks * k // ROUNDS: -(-seen.capacity // (2 * (ROUNDS - 1))) for k in range(1, ROUNDS)}

@@ -2,12 +2,13 @@
 
     rest point    V(x) = V₂(y) + |y|² N(y)             y = x − x̄, N(0) = 0
     horizon       V(t, x) = ψ(x) + V₂(t, y) − V₂(T, y) + (1 − t/T) (c + s N(t, x, ψ(x)))
+    target        V(x) = ψ(x) + s max(l(x), 0) exp N(x)
 
 V₂ = w̄ + p̄·y + ½ y'Py is the linear-quadratic solution at the rest point x̄. The network changes neither the value nor
 the first two derivatives there, and |·|² is the norm of P itself, so the network is a relative correction. Under a
 horizon T the value is the terminal cost ψ at t = T, and V₂ is the linear-quadratic solution at the center of the
 states, see ``riccati``. The terminal cost is also an input of the network, which then needs few weights for a value
-that is similar to a smoother ψ.
+that is similar to a smoother ψ. With a target l ≤ 0 the value is the exit cost ψ on it, and larger outside.
 """
 
 from typing import Any
@@ -123,6 +124,40 @@ class HorizonAnsatz:
         row = values[i] + risen * (values[i + 1] - values[i])
         row = row + h * bent * ((1 - s) * rates[i] - s * rates[i + 1])
         return row[0] + row[1 : 1 + n] @ y + y @ (row[1 + n :].reshape(n, n) @ y) / 2
+
+
+@pytree_dataclass()
+class TargetAnsatz:
+    """The cost to a target, with a network.
+
+    Args:
+      weights: the weights of the network.
+      center: the middle of the box, shape (n,).
+      size: half the widths of the box, shape (n,).
+      scale: s, the cost per unit of l.
+    """
+
+    weights: Weights
+    center: Any
+    size: Any
+    scale: Any
+
+    def __call__(self, problem: Problem, t: Number, x: State) -> Scalar:
+        """V at one state, whose gradient on the boundary of the target is the limit from outside."""
+        paid = problem.exit_cost
+        if callable(paid):
+            paid = paid(*problem.state_arguments(x, t))
+        inside = target_level(problem, t, x)
+        outside = inside + jax.lax.stop_gradient(jnp.maximum(inside, 0) - inside)
+        growth = jnp.exp(evaluate_network(self.weights, (x - self.center) / self.size))
+        return jnp.asarray(0.0 if paid is None else paid, x.dtype) + self.scale * outside * growth
+
+
+def target_level(problem: Problem, t: Number, x: State) -> jax.Array:
+    """l, which is ≤ 0 in the target, at one state; 1 without a target."""
+    if problem.target is None:
+        return jnp.ones((), x.dtype)
+    return jnp.asarray(problem.target(*problem.state_arguments(x, t)), x.dtype)
 
 
 def terminal_cost(problem: Problem, t: Number, x: State) -> jax.Array:

@@ -155,7 +155,9 @@ def deep_bsde(
     widths, seed = checked_layers(layers, NAME), ingredients.known_seed(seed, NAME)
     clock = Clock(seconds=time_limit, progress=progress)
     with noting_interrupts(clock), own_settings(x64=True):
-        settled, rule = ingredients.settled_problem(problem, len(start), NAME, {})
+        settled, rule = ingredients.settled_problem(
+            problem, len(start), NAME, {"target": "paths that end on a target have no common horizon"}
+        )
         if settled.noise is None or not influence(settled, len(start), np.dtype(np.float64)).noise.is_constant:
             raise ValueError(f"{NAME}: wanted a problem with noise that does not depend on the control")
         plant = Plant(settled, jnp.asarray(start), horizon, rule)

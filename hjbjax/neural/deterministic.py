@@ -24,7 +24,7 @@ from hjbjax.feedback.simulation import rollout
 from hjbjax.hamiltonian import pointwise
 from hjbjax.hamiltonian.pointwise import Rule
 from hjbjax.neural import ingredients, riccati
-from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz, norm_of, terminal_cost
+from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz, TargetAnsatz, norm_of, target_level, terminal_cost
 from hjbjax.neural.extremal_samples import TOL, ExtremalSamples
 from hjbjax.neural.network import checked_layers, initial_weights
 from hjbjax.neural.solution import NeuralSolution, value_of, weights_of_guess
@@ -41,6 +41,7 @@ from hjbjax.solution.status import Status
 NAME = "neural.solve"
 FLOOR = 0.01  # of the mean size of the terms: below it a residual counts relative to this size
 HELD_OUT, FRESH = 1024, 4 * 1024  # states that choose the best weights, and states of the final residual
+EXPONENTS, HALVINGS = (-15.0, 15.0), 44  # of the cost per unit of the target function, in any units, as powers of ten
 CHOOSING = 4  # held-out extremals, at most, that choose the best weights; the others only validate
 CANDIDATES = 64  # random states per extremal; the one with the largest residual is its start
 ROUNDS = 4  # in which the extremals are computed, half of them before the training
@@ -71,7 +72,10 @@ class Equation:
     rule: Rule
 
     def terms(self, ansatz: Callable, t: Number, x: State) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The residual V_t + min_u [L + f·DV] − βV and the size of its terms, in cost per unit time, and V."""
+        """The residual V_t + min_u [L + f·DV] − βV and the size of its terms, in cost per unit time, and V.
+
+        Residual and size are zero in the target.
+        """
         problem = self.problem
         value, (rate, p) = jax.value_and_grad(ansatz, (1, 2))(problem, t, x)
         # the control minimises H, so its own derivative contributes nothing
@@ -79,6 +83,7 @@ class Equation:
         paid = pointwise.running_cost(problem, t, x, u)
         moved = jnp.asarray(problem.drift(*problem.arguments(x, u, t=t)), p.dtype) @ p
         parts = jnp.stack([rate, paid, moved, -problem.discount * value])
+        parts = jnp.where(target_level(problem, t, x) > 0, parts, 0)
         return jnp.sum(parts), jax.lax.stop_gradient(jnp.sum(jnp.abs(parts)) / 2), value
 
     def relative_residual(self, ansatz: Callable, t: Number, x: State) -> jax.Array:
@@ -119,8 +124,9 @@ def solve(
 
     Args:
       problem: deterministic, with one player, costs, controls in a ``Box`` or a ``Ball`` with finite bounds, and a rest
-        point inside the box or a horizon. The minimum over the controls must have a formula: drift and cost are sums of
-        quadratic polynomials of one control each.
+        point inside the box, a horizon, or a target. The minimum over the controls must have a formula: drift and cost
+        are sums of quadratic polynomials of one control each. The target function must have a nonzero gradient on the
+        boundary, such as a signed distance, and V must be above the exit cost near the target in proportion to it.
       lo: lower corner of the box, shape (n,).
       hi: upper corner, shape (n,).
 
@@ -166,15 +172,7 @@ def solve(
         settled, rule = ingredients.settled_problem(problem, n, NAME, {"noise": "see deep_bsde"})
         assert rule is not None
         equation = Equation(settled, jnp.asarray(corners[0]), jnp.asarray(corners[1]), 0.0, 0.0, rule)
-        if horizon is None:
-            ansatz: Any
-            bias = 0.0 if quadratic else BIAS
-            equation, ansatz = _at_rest(equation, rest, quadratic, initial_weights(seed, n, widths, bias=bias))
-            options: dict[str, Any] = {"rest": ansatz.state}
-        else:
-            duration = float(arguments.positive(horizon, f"{NAME}: horizon", "in units of time"))
-            equation, ansatz = _over_horizon(equation, duration, quadratic, initial_weights(seed, n + 2, widths))
-            options = {"horizon": duration}
+        equation, ansatz, options = _begun(equation, horizon, rest, quadratic, seed, widths)
         if guess is not None:
             begun = weights_of_guess(guess, np.shape(ansatz.weights[0][0])[0], widths, NAME)
             ansatz = dataclasses.replace(ansatz, weights=begun)
@@ -197,6 +195,45 @@ def solve(
         return dataclasses.replace(
             solution, code=int(status), validation=validation, history=np.array(found.history), seconds=clock.elapsed()
         )
+
+
+def _begun(
+    equation: Equation, horizon: float | None, rest: Any, quadratic: bool, seed: int, widths: tuple[int, ...]
+) -> tuple[Equation, Any, dict[str, Any]]:
+    """The equation with its floor, the ansatz before the training, and the options of its extremals."""
+    n = len(np.asarray(equation.lo))
+    if equation.problem.target is not None:
+        if horizon is not None or equation.problem.time_dependent:
+            raise ValueError(
+                f"{NAME}: got a target together with a horizon or a dependence on time, wanted a problem that runs\n"
+                "until it reaches the target. Leave out horizon=, or solve it on a grid"
+            )
+        return *_to_target(equation, initial_weights(seed, n, widths)), {}
+    if horizon is None:
+        weights = initial_weights(seed, n, widths, bias=0.0 if quadratic else BIAS)
+        equation, at_rest = _at_rest(equation, rest, quadratic, weights)
+        return equation, at_rest, {"rest": at_rest.state}
+    duration = float(arguments.positive(horizon, f"{NAME}: horizon", "in units of time"))
+    return *_over_horizon(equation, duration, quadratic, initial_weights(seed, n + 2, widths)), {"horizon": duration}
+
+
+def _to_target(equation: Equation, weights: Any) -> tuple[Equation, TargetAnsatz]:
+    """The equation with its floor, and a cost to the target proportional to l, whose residual has the median zero."""
+    places = equation.places(jax.random.key(0), HELD_OUT)
+    levels = np.asarray(jax.jit(jax.vmap(lambda t, x: target_level(equation.problem, t, x)))(*places))
+    if not np.any(levels > 0):
+        raise ValueError(f"{NAME}: all of {HELD_OUT} random states of the box are in the target; wanted a larger box")
+    ansatz = TargetAnsatz(weights, (equation.lo + equation.hi) / 2, (equation.hi - equation.lo) / 2, 0.0)
+    low, high, size = *EXPONENTS, 0.0
+    for _ in range(HALVINGS):  # at half of the states the residual is positive: V grows too slowly there
+        middle = (low + high) / 2
+        ansatz = dataclasses.replace(ansatz, scale=10.0**middle)
+        residuals, sizes, _ = _terms_at(equation, ansatz, places)
+        low, high = (middle, high) if np.median(residuals[levels > 0]) > 0 else (low, middle)
+        size = float(np.mean(sizes[levels > 0]))
+    if min(high - EXPONENTS[0], EXPONENTS[1] - low) < 1:
+        raise ValueError(f"{NAME}: found no cost that grows with the distance from the target; check cost and drift")
+    return dataclasses.replace(equation, floor=FLOOR * size), ansatz
 
 
 def _at_rest(equation: Equation, near: Any, quadratic: bool, weights: Any) -> tuple[Equation, RestAnsatz]:
@@ -389,6 +426,7 @@ def closed_loop_costs(solution: NeuralSolution, starts: np.ndarray, duration: fl
             due="terminal cost" if timed else "nothing",
         )  # fmt: skip
         left = 0.0 if timed else jnp.exp(-problem.discount * duration) * value_of(solution, 0.0, path.states[-1])
-        return path.cost + left
+        # a path that reached its target has paid the exit cost
+        return path.cost + jnp.where(jnp.isfinite(path.reached), 0.0, left)
 
     return np.asarray(jax.jit(jax.vmap(cost, (None, 0)))(solution, jnp.asarray(starts)))

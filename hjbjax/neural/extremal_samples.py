@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.extremals.indirect_method import pontryagin
+from hjbjax.neural.ansatz import target_level
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import State
 from hjbjax.solution.clock import Clock
@@ -49,8 +50,10 @@ class ExtremalSamples:
         self.states, self.costates = np.zeros((size, n)), np.zeros((size, n))
 
     def collect(self, problem: Problem, starts: Iterable[State], clock: Clock) -> None:
-        """Add the extremals from some starts, until the clock is over."""
+        """Add the extremals from those starts that are outside the target, until the clock is over."""
         for start in starts:
+            if problem.target is not None and target_level(problem, 0.0, jnp.asarray(start)) <= 0:
+                continue
             if clock.over() is not None or len(self.starts) == self.capacity:
                 return
             try:

@@ -11,7 +11,6 @@ from hjbjax.tracing import checks, closures
 
 REFUSED = {  # ingredients for which there is no ansatz, with the reason
     "disturbances": "a game has a saddle point, and only a minimum over controls is computed",
-    "target": "there is no ansatz for the boundary of a target",
     "stopping_cost": "there is no ansatz for stopping",
     "running_max": "a running maximum is not an integral",
     "growth": "the discount must be a number",

@@ -10,7 +10,7 @@ import numpy as np
 
 from hjbjax.hamiltonian import pointwise
 from hjbjax.hamiltonian.pointwise import Rule
-from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz
+from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz, TargetAnsatz
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import as_jax, cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
@@ -130,8 +130,10 @@ class NeuralSolution(files.Saved):
         if len(where) != 1 + timed:
             wanted = "(t, x): the value depends on time" if timed else "(x): the value does not depend on time"
             raise ValueError(f"NeuralSolution.{name}: got {len(where)} arguments, wanted {wanted}")
-        if timed and self.problem is None:
-            raise ValueError(f"NeuralSolution.{name}: the terminal cost is missing; pass the problem to load")
+        if self.problem is None and not isinstance(self.ansatz, RestAnsatz):
+            raise ValueError(
+                f"NeuralSolution.{name}: the terminal cost or the target is missing; pass the problem to load"
+            )
         traced = is_traced(self, where)
         xp: Any = jnp if traced else np
         t: Any
@@ -157,8 +159,8 @@ class NeuralSolution(files.Saved):
 
         Args:
           path: the file.
-          problem: the problem, which a file cannot hold. Needed for controls, and for values over a horizon, which
-            contain the terminal cost.
+          problem: the problem, which a file cannot hold. Needed for controls, and for values over a horizon or to a
+            target, which contain the terminal cost or the target.
 
         Raises:
           FileError: the file is missing, damaged or foreign.
@@ -196,7 +198,7 @@ class NeuralSolution(files.Saved):
     @classmethod
     def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
         """The solution with the header and the arrays of a file."""
-        kinds: dict[str, Any] = {kind.__name__: kind for kind in (RestAnsatz, HorizonAnsatz)}
+        kinds: dict[str, Any] = {kind.__name__: kind for kind in (RestAnsatz, HorizonAnsatz, TargetAnsatz)}
         if header["ansatz"] not in kinds:
             raise FileError(f"its ansatz {header['ansatz']!r} is not known here: update hjbjax")
         weights = tuple((arrays[f"matrix{i}"], arrays[f"bias{i}"]) for i in range(header["layers"]))

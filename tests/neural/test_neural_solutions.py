@@ -82,6 +82,31 @@ def test_a_linear_quadratic_value_over_a_horizon_is_exact():
     assert found.status is hjb.Status.CONVERGED
 
 
+def ball(x):
+    """The signed distance to a ball, also where it has no gradient."""
+    return jnp.sqrt(x @ x + 1e-30) - 0.4
+
+
+def to_ball(paid):
+    return hjb.Problem(
+        lambda x, u: u, lambda x, u: paid(x) + u @ u, hjb.Box([-50.0] * 3, [50.0] * 3), target=ball, exit_cost=0.5
+    )
+
+
+def test_a_cost_proportional_to_the_distance_from_a_target_is_exact(tmp_path):
+    """The speed s costs (1 + s²)/s per unit of length, at least 2."""
+    found = neural.solve(to_ball(lambda x: 1.0), *CORNERS, seed=0, **CHEAP)
+    length = np.linalg.norm(STATES, axis=1, keepdims=True)
+    assert np.min(length) > 0.4
+    assert np.allclose(found.value_at(STATES), 0.5 + 2 * (length[:, 0] - 0.4), rtol=1e-6)
+    assert np.allclose(found.control_at(STATES), -STATES / length, atol=1e-6)
+    assert found.value_at([0.1, 0.0, -0.2]) == 0.5
+    assert found.status is hjb.Status.CONVERGED
+    found.save(tmp_path / "value")
+    with pytest.raises(ValueError, match="target is missing"):
+        neural.NeuralSolution.load(tmp_path / "value").value_at(STATES)
+
+
 def test_it_is_a_feedback(quadratic):
     path = hjb.simulate(PLANT, quadratic, STATES[0], 20.0)
     assert abs(path.cost / quadratic.value_at(STATES[0]) - 1) < 1e-4
@@ -207,9 +232,10 @@ def test_what_is_not_supported_is_refused():
         neural.deep_bsde(quartic, START, 1.0, seed=0)
     with pytest.raises(ValueError, match="noise"):
         neural.solve(noisy(), [-1.0] * 2, [1.0] * 2, seed=0)
-    target = hjb.Problem(lambda x, u: u, lambda x, u: u @ u, hjb.Box([-1.0], [1.0]), target=lambda x: x[0])
-    with pytest.raises(ValueError, match="target"):
-        neural.solve(target, [-1.0], [1.0], seed=0)
+    with pytest.raises(ValueError, match="target together with a horizon"):
+        neural.solve(to_ball(lambda x: 1.0), CORNERS[0], CORNERS[1], seed=0, horizon=1.0)
+    with pytest.raises(ValueError, match="random states of the box are in the target"):
+        neural.solve(to_ball(lambda x: 1.0), [-0.1] * 3, [0.1] * 3, seed=0)
     with pytest.raises(ValueError, match="lo must be smaller"):
         neural.solve(PLANT, CORNERS[1], CORNERS[0], seed=0, **CHEAP)
     with pytest.raises(ValueError, match="rest point"):
@@ -309,6 +335,30 @@ def test_a_manufactured_value_over_a_horizon():
     exact = np.asarray(jax.vmap(value)(times, states))
     assert relative(found.value_at(times, states) - exact, exact) < 0.02
     assert np.allclose(found.value_at(horizon, states), jax.vmap(value, (None, 0))(horizon, states), rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_a_manufactured_cost_to_a_target_in_five_states():
+    """The cost ¼ |DV|² + |u|² with x' = u has the value V, which is zero on the target."""
+
+    def value(x):
+        return ball(x) * (1.5 + 0.3 * x[0] + 0.2 * jnp.sin(x[1] + x[2]))
+
+    def paid(x):
+        slope = jax.grad(value)(x)
+        return 0.25 * slope @ slope
+
+    problem = hjb.Problem(
+        lambda x, u: u, lambda x, u: paid(x) + u @ u, hjb.Box([-50.0] * 5, [50.0] * 5), target=ball
+    )  # fmt: skip
+    found = neural.solve(problem, [-1.0] * 5, [1.0] * 5, seed=0, steps=600, extremals=16, held_out=4)
+    assert found.status is hjb.Status.CONVERGED
+    states = np.random.default_rng(1).uniform(-1, 1, (2000, 5))
+    states = states[np.linalg.norm(states, axis=1) > 0.4]
+    exact = np.asarray(jax.vmap(value)(states))
+    assert relative(found.value_at(states) - exact, exact) < 0.03
+    assert abs(found.validation["excess_cost"]) < 0.01
 
 
 @pytest.mark.slow

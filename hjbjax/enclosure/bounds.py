@@ -7,45 +7,49 @@ from typing import Any, Self
 import numpy as np
 
 from hjbjax.enclosure.interpolant import Spline, axis_table
+from hjbjax.enclosure.levels import Levels
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Numbers
 from hjbjax.solution import archive, files
 from hjbjax.solution.status import Status
-from hjbjax.tracing.intervals import point
 
 SIDES = ("lower", "upper")
 
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """One bound: the best of several shifted splines.
+    """One bound: the best of several functions of splines.
 
     Attributes:
       spline: the cells of the grid.
       coefficients: of every spline, each (*grid).
-      shifts: the numbers that are subtracted from a lower bound, or added to an upper bound.
-      sign: 1 for a lower and −1 for an upper bound.
+      levels: the function of every spline that is a bound.
+      sign: 1 for a lower and −1 for an upper bound, before a change of sign.
+      caps: numbers per cell to which the bound is raised, and then lowered, (2, *cells); ``None`` without a target.
+      negated: True if minus this is the bound, for rewards.
     """
 
     spline: Spline
     coefficients: tuple[np.ndarray, ...]
-    shifts: tuple[float, ...]
+    levels: tuple[Levels, ...]
     sign: int
+    caps: np.ndarray | None = None
+    negated: bool = False
 
     def at(self, states: np.ndarray) -> np.ndarray:
         """The bound at states (count, n) inside the box, rounded to its side."""
         best, places = np.full(len(states), -self.sign * np.inf), self.spline.at(states)
-        for values, shift in zip(self.coefficients, self.shifts, strict=True):
-            found = places.values(values)
-            if self.sign > 0:
-                best = np.maximum(best, (found - point(shift)).lo)
-            else:
-                best = np.minimum(best, (found + point(shift)).hi)
-        return best
+        for values, levels in zip(self.coefficients, self.levels, strict=True):
+            found = levels.at(places.values(values))
+            best = np.maximum(best, found) if self.sign > 0 else np.minimum(best, found)
+        if self.caps is not None:
+            least, largest = (each[self.spline.index(states)] for each in self.caps)
+            best = np.minimum(np.maximum(best, least), largest)
+        return -best if self.negated else best
 
     def negative(self) -> "Bound":
         """Minus the bound, which is a bound from the other side."""
-        return Bound(self.spline, tuple(-each for each in self.coefficients), self.shifts, -self.sign)
+        return dataclasses.replace(self, negated=not self.negated)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,7 +59,7 @@ class Enclosure(files.Saved):
     Args:
       grid: the grid.
       lower: the lower bound at the nodes, shape (*grid), in cost units.
-      upper: the upper bound at the nodes.
+      upper: the upper bound at the nodes. Without a discount it may be infinite, and for rewards the lower one.
       status: CONVERGED if the mean width is at most ``tol`` times the range of V, otherwise MAX_STEPS. The bounds hold
         in both cases.
       message: the problem that the bounds refer to, and their mean width.
@@ -63,8 +67,11 @@ class Enclosure(files.Saved):
       remaining: e^{−βT} at the nodes, shape (*grid), where T is a lower bound of the time until a path can meet a
         projected end. If the problem continues beyond the box, its value differs from the value between walls by at
         most this factor times the largest difference at the ends. Zero without projected ends.
+        Without a discount it is zero where a path that meets an end costs more than the upper bound, so that the ends
+        do not matter, and one at the other nodes.
       required: the shift that the cell around each node requires for the lower and for the upper bound before the
-        corrections, shape (2, *grid), in cost units. More nodes help most where it is large.
+        corrections, shape (2, *grid), in cost units; without a discount the defect relative to the running cost. More
+        nodes help most where it is large.
       bounds: the lower and the upper bound as functions.
     """
 
@@ -120,7 +127,9 @@ class Enclosure(files.Saved):
     def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         header = {
             "grid": archive.about_grid(self.grid), "code": int(self.status), "message": self.message,
-            "stats": self.stats, "splines": [len(each.shifts) for each in self.bounds],
+            "stats": self.stats, "splines": [len(each.levels) for each in self.bounds],
+            "levels": [len(each.levels[0].edges) for each in self.bounds], "negated": self.bounds[0].negated,
+            "capped": self.bounds[0].caps is not None,
         }  # fmt: skip
         names = ("lower", "upper", "remaining", "required")
         arrays = {"lo": self.grid.lo, "hi": self.grid.hi, **{name: getattr(self, name) for name in names}}
@@ -128,7 +137,10 @@ class Enclosure(files.Saved):
         arrays |= {f"axis{axis}": table.at for axis, table in enumerate(self.bounds[0].spline.tables)}
         for name, bound in zip(SIDES, self.bounds, strict=True):
             arrays[f"{name}_coefficients"] = np.stack(bound.coefficients)
-            arrays[f"{name}_shifts"] = np.array(bound.shifts)
+            parts = [(each.edges, each.values, each.slopes) for each in bound.levels]
+            arrays[f"{name}_levels"] = np.array(parts)
+            if bound.caps is not None:
+                arrays[f"{name}_caps"] = bound.caps
         return header, arrays
 
     @staticmethod
@@ -138,8 +150,10 @@ class Enclosure(files.Saved):
         shapes: dict[str, tuple[int, ...]] = {name: (len(shape),) for name in ("lo", "hi")}
         shapes |= {**dict.fromkeys(("lower", "upper", "remaining"), shape), "required": (2, *shape)}
         shapes |= {f"axis{axis}": (count + bool(cyclic[axis]),) for axis, count in enumerate(shape)}
-        for name, count in zip(SIDES, header["splines"], strict=True):
-            shapes |= {f"{name}_coefficients": (count, *shape), f"{name}_shifts": (count,)}
+        for name, count, levels in zip(SIDES, header["splines"], header["levels"], strict=True):
+            shapes |= {f"{name}_coefficients": (count, *shape), f"{name}_levels": (count, 3, levels)}
+            if header["capped"]:
+                shapes[f"{name}_caps"] = (2, *(n + bool(each) for n, each in zip(shape, cyclic, strict=True)))
         return {name: files.Expected((each,), (np.float64,), optional=False) for name, each in shapes.items()}
 
     @classmethod
@@ -148,9 +162,13 @@ class Enclosure(files.Saved):
         grid = archive.grid_of(header["grid"], arrays["lo"], arrays["hi"])
         spline = Spline(tuple(axis_table(arrays[f"axis{k}"], cyclic) for k, cyclic in enumerate(grid.periodic)))
         lower, upper = (
-            Bound(spline, tuple(arrays[f"{name}_coefficients"]), tuple(arrays[f"{name}_shifts"].tolist()), sign)
-            for name, sign in zip(SIDES, (1, -1), strict=True)
-        )
+            Bound(
+                spline, tuple(arrays[f"{name}_coefficients"]),
+                tuple(Levels(each[0], each[1], each[2], sign) for each in arrays[f"{name}_levels"]), sign,
+                arrays.get(f"{name}_caps"), bool(header["negated"]),
+            )
+            for name, sign in zip(SIDES, (-1, 1) if header["negated"] else (1, -1), strict=True)
+        )  # fmt: skip
         return cls(
             grid, arrays["lower"], arrays["upper"], Status(header["code"]), header["message"], header["stats"],
             arrays["remaining"], arrays["required"], (lower, upper),

@@ -1,7 +1,8 @@
 """Corrections of a candidate W by the defects that paths meet on their way.
 
 Let E solve (β − L^π) E = β s, where L^π is the generator of the Markov chain under a policy π: the discounted mean of s
-along the path from each node. Subtracting E from W lowers the defect β W − H by about β s. Two uses:
+along the path from each node. Subtracting E from W lowers the defect β W − H by about β s. Without a discount the right
+side is the running cost times s, and E is zero on the target. Two uses:
 
 - s is the middle of the range of the defect in each cell: defect correction, which removes most of the discretisation
   error of the node values.
@@ -40,13 +41,13 @@ def on_nodes(cells: np.ndarray, grid: Grid, join: Callable[..., Any] = np.mean) 
 def solver(
     problem: Problem, grid: Grid, policy: np.ndarray | None, rate: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The solution E of (β − L^π) E = β s as a function of s.
+    """The solution E of (β − L^π) E = s as a function of s.
 
     Args:
       problem: the problem.
       grid: the grid.
       policy: the control at every node, shape (*grid, m); ``None`` without controls.
-      rate: β at every node, shape (*grid).
+      rate: β at every node, shape (*grid); without a discount one on the target and a small number elsewhere.
     """
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import bicgstab, splu
@@ -55,11 +56,11 @@ def solver(
     matrix = (diags_array(rate.ravel()) - chain.generator(without, grid, policy)).tocsc()
     if grid.ndim <= DIRECT:
         factors = splu(matrix)
-        return lambda source: factors.solve((rate * source).ravel()).reshape(grid.shape)
+        return lambda source: factors.solve(source.ravel()).reshape(grid.shape)
     scale = diags_array(1 / matrix.diagonal())
 
     def solve(source: np.ndarray) -> np.ndarray:
-        found, _ = bicgstab(matrix, (rate * source).ravel(), rtol=1e-6, maxiter=500, M=scale)
+        found, _ = bicgstab(matrix, source.ravel(), rtol=1e-6, maxiter=500, M=scale)
         return found.reshape(grid.shape)
 
     return solve
@@ -73,3 +74,22 @@ def smooth_cover(excess: np.ndarray, grid: Grid) -> np.ndarray:
         mode, size = "wrap" if cyclic else "nearest", 2 * max(REACH, excess.shape[axis] // SHARE) + 1
         excess = uniform_filter1d(maximum_filter1d(excess, size, axis, mode=mode), size, axis, mode=mode)
     return MARGIN * excess
+
+
+def away_from(mask: np.ndarray, grid: Grid) -> np.ndarray:
+    """True at the nodes that are neither in a set nor next to it."""
+    from scipy.ndimage import maximum_filter1d
+
+    found = mask
+    for axis, cyclic in enumerate(grid.periodic):
+        found = maximum_filter1d(found, 3, axis, mode="wrap" if cyclic else "nearest")
+    return ~found
+
+
+def nearest_known(numbers: np.ndarray, known: np.ndarray, grid: Grid) -> np.ndarray:
+    """Numbers at nodes, with unknown ones replaced by the number of the nearest known node."""
+    from scipy.ndimage import distance_transform_edt
+
+    spacings = [float(grid.spacing(axis)) for axis in range(grid.ndim)]
+    index = distance_transform_edt(~known, spacings, return_distances=False, return_indices=True)
+    return numbers[tuple(index)]

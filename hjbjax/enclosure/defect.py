@@ -54,6 +54,7 @@ class CellBlock:
       cells: the parts.
       known: the functions of the problem.
       walls: the axes whose walls stop the paths, with the side of each part: −1 for the lower and 1 for the upper end.
+      ended: True for parts inside the target, where nothing is required; ``None`` without a target.
     """
 
     index: Index
@@ -61,6 +62,7 @@ class CellBlock:
     cells: Cells
     known: Functions
     walls: dict[int, np.ndarray]
+    ended: np.ndarray | None = None
 
 
 @quietly
@@ -74,8 +76,7 @@ def blocks(problem: Problem, grid: Grid, spline: Spline, index: Index, depth: in
       index: the number of each cell along every axis.
       depth: the number of bisections along every axis: each cell is cut into 2^depth parts along it.
     """
-    pairs = zip(index, spline.shape, strict=True)
-    sides = [np.where(i == 0, -1, np.where(i == cells - 1, 1, 0)) for i, cells in pairs]
+    sides = _sides(index, spline)
     projected = set(grid.sides("projected"))
     walls = [np.isin(side, [step for axis_, step in projected if axis_ == axis]) for axis, side in enumerate(sides)]
     walls = [wall & (side != 0) for wall, side in zip(walls, sides, strict=True)]
@@ -95,8 +96,31 @@ def blocks(problem: Problem, grid: Grid, spline: Spline, index: Index, depth: in
             cells = spline.cells([np.repeat(i, number) for i in block], parts)
             x = tf.coordinates(cells.ranges, cells.centres, grid.ndim)
             signs = {axis: np.repeat(side[axis], number) for axis in stopped}
-            found.append(CellBlock(block, number, cells, functions(problem, x, cells.radii), signs))
+            ended = None
+            if problem.target is not None:
+                (level,) = tf.taylor_forms(problem.target, x).reshape(-1)
+                ended = np.broadcast_to(level.bounds(cells.radii).hi <= 0, cells.ranges[0].lo.shape)
+            found.append(CellBlock(block, number, cells, functions(problem, x, cells.radii), signs, ended))
     return found
+
+
+def _sides(index: Index, spline: Spline) -> list[np.ndarray]:
+    """Per axis −1 for the first, 1 for the last and 0 for every other cell."""
+    pairs = zip(index, spline.shape, strict=True)
+    return [np.where(i == 0, -1, np.where(i == cells - 1, 1, 0)) for i, cells in pairs]
+
+
+def parts_of(grid: Grid, spline: Spline, index: Index, depth: int) -> Cells:
+    """The parts of some cells inside the box, 2^depth along every axis, the parts of one cell after each other.
+
+    Args:
+      grid: the grid.
+      spline: its cells.
+      index: the number of each cell along every axis.
+      depth: the number of bisections along every axis.
+    """
+    ends = _parts(grid, _sides(index, spline), [depth] * grid.ndim, ())
+    return spline.cells([np.repeat(i, 2 ** (depth * grid.ndim)) for i in index], ends)
 
 
 def all_cells(spline: Spline) -> Index:
@@ -123,7 +147,10 @@ def defects(spline: Spline, known: Sequence[CellBlock], values: np.ndarray, befo
         total.low[block.index], total.high[block.index] = np.inf, -np.inf
     for block in known:
         found, policy = over_block(block, values)
-        low, high = (each.reshape(-1, block.number) for each in found.ends)
+        low, high = found.ends
+        if block.ended is not None:
+            low, high = np.where(block.ended, np.inf, low), np.where(block.ended, -np.inf, high)
+        low, high = (each.reshape(-1, block.number) for each in (low, high))
         total.low[block.index] = np.minimum(total.low[block.index], low.min(axis=1))
         total.high[block.index] = np.maximum(total.high[block.index], high.max(axis=1))
         if not block.walls:
@@ -155,7 +182,7 @@ def _parts(
 
 
 def over_block(block: CellBlock, values: np.ndarray) -> tuple[Interval, np.ndarray]:
-    """Bounds of (β W − H)/β over parts of some cells, and a control.
+    """Bounds of (β W − H)/β over parts of some cells, and a control; without a discount −H over the least cost.
 
     Args:
       block: the parts.
@@ -174,6 +201,6 @@ def over_block(block: CellBlock, values: np.ndarray) -> tuple[Interval, np.ndarr
         low = (point(low) - loss).lo
     if every:
         high = np.where(rises, np.maximum(high, found.least[every]), high)
-    # β is positive
-    ratios = [point(each) / found.rate for each in (np.minimum(low, high), high)]
+    # the unit is positive
+    ratios = [point(each) / found.unit for each in (np.minimum(low, high), high)]
     return Interval(ratios[0].lo, ratios[1].hi), found.policy

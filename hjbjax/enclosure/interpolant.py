@@ -318,10 +318,14 @@ class Spline:
             error, size = error + (weights.error / weights.size)[fill], size * weights.size[fill]
         return found.max(axis=0) + 2 * size * error
 
+    def index(self, states: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The number of the cell of every state along every axis."""
+        return tuple(np.searchsorted(table.between, states[:, k], side="right") for k, table in enumerate(self.tables))
+
     def at(self, states: np.ndarray) -> "States":
         """The spline at some states inside the box, shape (count, n), for any coefficients."""
         rows, size, error = [], np.ones(()), np.zeros(())
-        index = [np.searchsorted(table.between, states[:, k], side="right") for k, table in enumerate(self.tables)]
+        index = self.index(states)
         for axis, (table, i) in enumerate(zip(self.tables, index, strict=True)):
             weights, slope = table.weights[:2]
             place = (point(states[:, axis]) - _take(table.lower, i)) / _take(table.lengths, i)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.sets import Ball, Box, Finite, Simplex, is_unbounded, ranges
 from hjbjax.tracing import intervals as iv
 from hjbjax.tracing import quadratics as qu
@@ -37,6 +37,7 @@ class Functions:
       x: the state.
       radii: the largest distance from the centre along every axis.
       rate: the discount.
+      unit: the positive number by which a defect is divided: the discount, or without one a lower bound of the cost.
       options: cost and drift as polynomials of the control, or for every action of a finite set; empty if they are not
         quadratic polynomials.
     """
@@ -45,6 +46,7 @@ class Functions:
     x: list[Form]
     radii: list[np.ndarray]
     rate: Form
+    unit: Interval
     options: list[tuple[qu.Polynomial, list[qu.Polynomial]]]
 
 
@@ -69,14 +71,14 @@ class CellDefect:
 
     Attributes:
       defect: the range of β W − H.
-      rate: the range of β.
+      unit: the positive number by which the defect is divided.
       least: for each set of coordinates that a wall stops, an upper bound of β W − H without their motion.
       drift: the range of every component of the drift under the minimisers.
       policy: a control near the minimiser at the centre, shape (count, m); proves nothing.
     """
 
     defect: Interval
-    rate: Interval
+    unit: Interval
     least: dict[frozenset[int], np.ndarray]
     drift: list[Interval]
     policy: np.ndarray
@@ -91,6 +93,10 @@ def functions(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> Funct
       radii: the largest distance from the centre along every axis.
     """
     (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
+    unit = rate.range
+    if not is_discounted(problem):  # an interval that contains zero makes the defect infinite
+        least = _running_cost(problem, x, any_action(problem.controls)).bounds(radii).lo
+        unit = point(np.maximum(least, 0.0))
     options: list[tuple[qu.Polynomial, list[qu.Polynomial]]] = []
     if isinstance(problem.controls, Finite):
         for u in np.asarray(problem.controls.points, float):
@@ -98,14 +104,14 @@ def functions(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> Funct
             drift = tf.taylor_forms(problem.drift, x, action)
             paid = qu.Polynomial({(): _running_cost(problem, x, action)})
             options.append((paid, [qu.Polynomial({(): each}) for each in drift]))
-        return Functions(problem, x, radii, rate, options)
+        return Functions(problem, x, radii, rate, unit, options)
     count = 0 if problem.controls is None else problem.controls.dim
     with contextlib.suppress(qu.NotQuadraticError):
         cost = qu.Polynomial({(): tf.constant(0.0)})
         if problem.cost is not None:
             cost = qu.quadratics(problem.cost, x, count)[0]
         options.append((cost, qu.quadratics(problem.drift, x, count)))
-    return Functions(problem, x, radii, rate, options)
+    return Functions(problem, x, radii, rate, unit, options)
 
 
 def cell_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
@@ -139,9 +145,7 @@ def _by_formula(
 
     found, actions, near = defect(frozenset())
     speeds = [range_over(component, actions) for component in drift] if stopped else []
-    return CellDefect(
-        found, known.rate.range, {each: defect(each)[0].hi for each in stopped}, speeds, _stacked(near, cell)
-    )
+    return CellDefect(found, known.unit, {each: defect(each)[0].hi for each in stopped}, speeds, _stacked(near, cell))
 
 
 def _stacked(inputs: Sequence[np.ndarray], cell: Cell) -> np.ndarray:
@@ -321,8 +325,16 @@ def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
     bounds = {without: (whole - tf.minimum(*found)).bounds(known.radii) for without, found in costs.items()}
     speeds = [iv.union(*(drift[k][()].range for _, drift in known.options)) for k in range(len(cell.p))]
     return CellDefect(
-        bounds[frozenset()], known.rate.range, {each: bounds[each].hi for each in stopped}, speeds, points[best]
+        bounds[frozenset()], known.unit, {each: bounds[each].hi for each in stopped}, speeds, points[best]
     )
+
+
+def any_action(admissible: Any) -> list[Form]:
+    """Every input of the control as one interval."""
+    if admissible is None:
+        return []
+    inputs = [Interval(np.asarray(lo), np.asarray(hi)) for lo, hi in zip(*ranges(admissible), strict=True)]
+    return [Form(each, each) for each in inputs]
 
 
 def _running_cost(problem: Problem, x: list[Form], u: list[Form]) -> Form:
@@ -364,7 +376,7 @@ def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
                 low = np.maximum(low, found)
         speeds.append([each.range for each in drift])
     return CellDefect(
-        Interval(low, high[frozenset()]), known.rate.range, {each: high[each] for each in stopped},
+        Interval(low, high[frozenset()]), known.unit, {each: high[each] for each in stopped},
         [iv.union(*each) for each in zip(*speeds, strict=True)], policy,
     )  # fmt: skip
 

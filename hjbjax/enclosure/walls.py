@@ -6,25 +6,22 @@ by at most e^{−βT(x)} times their largest difference at the ends. T follows f
 layer of cells.
 """
 
-from typing import Any
-
 import numpy as np
 
 from hjbjax.enclosure.defect import all_cells
 from hjbjax.enclosure.interpolant import Spline
+from hjbjax.enclosure.minimum import any_action
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import ranges
 from hjbjax.tracing import taylor_forms as tf
-from hjbjax.tracing.intervals import Interval, quietly
-from hjbjax.tracing.taylor_forms import Form
+from hjbjax.tracing.intervals import quietly
 
 ROUNDING = 1e-12  # relative, larger than the rounding of all sums below
 
 
 @quietly
-def remaining(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
-    """The largest discount factor at the time when a path from each node meets a projected end, shape (*grid).
+def times(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
+    """A lower bound of the time until any path from each node meets a projected end, shape (*grid).
 
     Args:
       problem: a problem of one player with costs.
@@ -32,16 +29,15 @@ def remaining(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
       spline: the cells.
 
     Returns:
-      e^{−βT}, rounded upward, with the least discount β in the box; zero without projected ends.
+      T, rounded downward; infinite without projected ends.
     """
     ends = grid.sides("projected")
     if not ends:
-        return np.zeros(grid.shape)
+        return np.full(grid.shape, np.inf)
     every = all_cells(spline)
     cells = spline.cells(every)
     x = tf.coordinates(cells.ranges, cells.centres, grid.ndim)
-    drift = tf.taylor_forms(problem.drift, x, _any_action(problem.controls))
-    (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
+    drift = tf.taylor_forms(problem.drift, x, any_action(problem.controls))
     soonest = np.full(grid.shape, np.inf)
     for axis, step in ends:
         outward = drift[axis].range.hi if step > 0 else -drift[axis].range.lo
@@ -51,13 +47,26 @@ def remaining(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
         crossing = gaps / np.maximum(layers[1:], layers[:-1])
         along = np.append(np.cumsum(crossing[::-1])[::-1], 0.0) if step > 0 else np.append(0.0, np.cumsum(crossing))
         soonest = np.minimum(soonest, along.reshape([-1 if k == axis else 1 for k in range(grid.ndim)]))
+    return soonest * (1 - ROUNDING)
+
+
+@quietly
+def remaining(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
+    """The largest discount factor at the time when a path from each node meets a projected end, shape (*grid).
+
+    Args:
+      problem: a problem of one player with costs and a discount.
+      grid: the grid.
+      spline: the cells.
+
+    Returns:
+      e^{−βT}, rounded upward, with the least discount β in the box; zero without projected ends.
+    """
+    if not grid.sides("projected"):
+        return np.zeros(grid.shape)
+    cells = spline.cells(all_cells(spline))
+    x = tf.coordinates(cells.ranges, cells.centres, grid.ndim)
+    (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
     least = max(float(np.min(rate.range.lo)), 0.0)
-    return np.minimum(np.exp(-least * soonest * (1 - ROUNDING)) * (1 + ROUNDING), 1.0)
-
-
-def _any_action(admissible: Any) -> list[Form]:
-    """Every input of the control as one interval."""
-    if admissible is None:
-        return []
-    inputs = [Interval(np.asarray(lo), np.asarray(hi)) for lo, hi in zip(*ranges(admissible), strict=True)]
-    return [Form(each, each) for each in inputs]
+    share = np.exp(-least * times(problem, grid, spline)) * (1 + ROUNDING)
+    return np.where(np.isfinite(share), np.minimum(share, 1.0), 1.0)

@@ -231,7 +231,7 @@ def test_what_is_not_proved_is_refused():
     for more, word in (
         ({}, "no discount"),
         ({"discount": 1.0, "noise": 0.1}, "noise"),
-        ({"discount": 1.0, "target": lambda x: jnp.abs(x[0]) - 0.1}, "target"),
+        ({"discount": 1.0, "target": lambda x: jnp.abs(x[0]) - 0.1}, "a target with a discount"),
         ({"discount": 1.0, "stopping_cost": 1.0}, "stopping_cost"),
         ({"discount": 1.0, "growth": lambda x, u: 0.1}, "growth"),
     ):

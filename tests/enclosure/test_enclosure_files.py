@@ -53,8 +53,8 @@ def _foreign(folder):
 
 
 def test_the_largest_required_shift_is_that_of_the_first_candidate(found):
-    for required, bound in zip(found.required, found.bounds, strict=True):
-        assert np.max(required) == bound.shifts[0]
+    for required, bound, sign in zip(found.required, found.bounds, (1, -1), strict=True):
+        assert -sign * np.max(required) == bound.levels[0].values[0]
 
 
 def test_the_picture_over_one_axis_has_both_bounds_and_the_width(found):

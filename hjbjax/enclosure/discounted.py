@@ -1,0 +1,209 @@
+"""Bounds of a problem with a discount: candidates, their corrections, and the shifts that make them bounds.
+
+A lower bound is the largest of several W − k. Each of them needs its inequality only in cells where it may exceed the
+earlier ones.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from hjbjax.enclosure import correction, defect, walls
+from hjbjax.enclosure.bounds import Bound
+from hjbjax.enclosure.defect import CellBlock, Defects
+from hjbjax.enclosure.interpolant import Spline
+from hjbjax.enclosure.levels import Levels
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem
+from hjbjax.tracing.intervals import point
+
+SMOOTHING = 3  # defect corrections before the bounds part
+WIDENED = 5.0  # the level of a correction is the largest defect divided by this number
+FALLS = 0.7  # a defect correction must reduce the mean defect to this fraction
+HELPS = 0.6  # a correction along the paths that leaves more than this fraction of the shift is compared with another
+STAGNANT = 2  # corrections without progress after which a bound is given up
+BISECTIONS = 2  # of the cells with the largest defects
+LARGEST = 0.5  # fraction of the largest defect from which on a cell is bisected
+GAIN = 0.97  # a correction that leaves more than this fraction of the width is no progress
+
+
+@dataclasses.dataclass(frozen=True)
+class DiscountTask:
+    """The data of both bounds.
+
+    Attributes:
+      problem: a problem of one player with costs.
+      grid: the grid.
+      spline: the cells of the grid.
+      known: the functions of the problem over all cells.
+      wanted: the width at which corrections stop, in cost units.
+      chosen: True at the nodes where narrow bounds are wanted, shape (*grid).
+    """
+
+    problem: Problem
+    grid: Grid
+    spline: Spline
+    known: list[CellBlock]
+    wanted: float
+    chosen: np.ndarray
+
+    def defects(self, values: np.ndarray) -> Defects:
+        """The defects of the spline with these coefficients."""
+        return defect.defects(self.spline, self.known, values)
+
+    def move(self, found: Defects, source: np.ndarray) -> np.ndarray:
+        """The correction of the coefficients by a source at the nodes, relative to the discount."""
+        rates, weights = self.rates()
+        return self.solve(found, rates, weights * source)
+
+    def solve(self, found: Defects, rates: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """The solution E of (β − L^π) E = source at the nodes, where π is the control that is optimal for W."""
+        policy = np.stack(
+            [correction.on_nodes(found.policy[..., j], self.grid) for j in range(found.policy.shape[-1])], axis=-1
+        ) if found.policy.shape[-1] else None  # fmt: skip
+        return correction.solver(self.problem, self.grid, policy, rates)(source)
+
+    def remaining(self, upper: Bound) -> np.ndarray:
+        """The influence of the projected ends, see ``Enclosure.remaining``."""
+        return walls.remaining(self.problem, self.grid, self.spline)
+
+    def rates(self) -> tuple[np.ndarray, np.ndarray]:
+        """The discount at the nodes, and the number by which a relative source is multiplied there."""
+        discount = self.problem.discount
+        if callable(discount):
+            rates = np.asarray(at_nodes(discount, self.grid))
+        else:
+            rates = np.full(self.grid.shape, float(discount))
+        return rates, rates
+
+    def continued(self, values: np.ndarray) -> np.ndarray:
+        """The coefficients where the problem does not determine them; here everywhere as given."""
+        return values
+
+    def middle(self, found: Defects) -> np.ndarray | None:
+        """The middle of the defect in every cell, or ``None`` if it is unbounded somewhere."""
+        middle = (found.low + found.high) / 2
+        return middle if np.all(np.isfinite(middle)) else None
+
+    def corrected(self, values: np.ndarray) -> tuple[np.ndarray, Defects]:
+        """The coefficients after defect corrections, as long as the mean defect falls, and their defects."""
+        values, nodes = self.continued(values), self.grid.nodes().reshape(-1, self.grid.ndim)
+        # a spline with the node values as its coefficients is too smooth
+        smoothed = self.spline.at(nodes).values(values).lo.reshape(self.grid.shape)
+        values = self.continued(2 * values - smoothed)
+        found = self.defects(values)
+        middle = self.middle(found)
+        for _ in range(SMOOTHING):
+            if middle is None:
+                break
+            changed = self.continued(values - self.move(found, correction.on_nodes(middle, self.grid)))
+            after = self.defects(changed)
+            remains = self.middle(after)
+            if remains is None or not np.mean(np.abs(remains)) < FALLS * np.mean(np.abs(middle)):
+                break
+            values, found, middle = changed, after, remains
+        return values, found
+
+    def bound(self, values: np.ndarray, found: Defects, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
+        """The best bound after corrections, and the shift that the cell around each node requires without them.
+
+        Raises:
+          ValueError: no bound is finite.
+        """
+        kept: list[tuple[np.ndarray, float]] = []
+        best, stagnant = np.full(self.grid.shape, -np.inf), 0
+        required = np.zeros(self.grid.shape)
+        for _ in range(rounds):
+            lead = self.lead(values, kept, sign)
+            found = self.bisected(values, found, lead, sign)
+            sizes = sizes_of(found, lead, sign)
+            shift = float(np.max(sizes))
+            if not np.isfinite(shift):
+                break
+            if not kept:
+                required = correction.on_nodes(sizes, self.grid, np.max)
+            before = np.mean(best[self.chosen])
+            best = np.maximum(best, sign * values - shift)
+            kept.append((values, shift))
+            # progress is measured by the part of the width that one more correction may win
+            gain = np.mean(best[self.chosen]) - before
+            stagnant = 0 if gain > (1 - GAIN) * max(shift, self.wanted) else stagnant + 1
+            if shift <= self.wanted / 4 or stagnant >= STAGNANT:
+                break
+            excess = correction.on_nodes(np.maximum(sizes - shift / WIDENED, 0), self.grid)
+            values, found = self.better(values, found, excess, kept, sign)
+        if not kept:
+            raise ValueError(_no_bound(self.grid, found, sign))
+        coefficients, shifts = zip(*kept, strict=True)
+        levels = tuple(Levels.shifted(shift, sign) for shift in shifts)
+        return Bound(self.spline, coefficients, levels, sign), required
+
+    def lead(self, values: np.ndarray, kept: list[tuple[np.ndarray, float]], sign: int) -> np.ndarray:
+        """The shift from which on a candidate is nowhere in a cell better than the bounds so far, shape (*cells)."""
+        found = np.full(self.spline.shape, np.inf)
+        for other, shift in kept:
+            found = np.minimum(found, (point(self.spline.largest(sign * (values - other))) + point(shift)).hi)
+        return found
+
+    def better(
+        self, values: np.ndarray, found: Defects, excess: np.ndarray, kept: list[tuple[np.ndarray, float]], sign: int
+    ) -> tuple[np.ndarray, Defects]:
+        """A correction for an excess at the nodes, and its defects.
+
+        It follows the paths. If this does not help, the better of it and of a bump at the nodes themselves: at a kink
+        that paths leave, the spline has an extremum, where the motion does not count and W must be the value of resting
+        there.
+        """
+        options: list[tuple[float, np.ndarray, Defects]] = []
+        for move in (lambda: self.move(found, correction.smooth_cover(excess, self.grid)), lambda: excess):
+            option = values - sign * move()
+            after = self.defects(option)
+            sizes = sizes_of(after, self.lead(option, kept, sign), sign)
+            shift = float(np.max(sizes))
+            options.append((float(np.mean((sign * option)[self.chosen])) - shift, option, after))
+            if shift < HELPS * kept[-1][1]:
+                break
+        _, option, after = max(options, key=lambda each: each[0])
+        return option, after
+
+    def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
+        """The defects with the cells that determine the shift cut into parts, at most one in ten."""
+        for depth in range(1, BISECTIONS + 1):
+            sizes = sizes_of(found, lead, sign)
+            if not np.all(np.isfinite(sizes)):
+                break
+            level = max(LARGEST * np.max(sizes), np.quantile(sizes, 0.9))
+            chosen = sizes >= level
+            # where the range of the defect is narrow, its largest value is already known
+            chosen &= found.high - found.low > 0.2 * np.abs(sizes)
+            if not np.any(chosen):
+                break
+            parts = defect.blocks(self.problem, self.grid, self.spline, np.nonzero(chosen), depth)
+            found = defect.defects(self.spline, parts, values, found)
+        return found
+
+
+def at_nodes(function: Any, grid: Grid) -> np.ndarray:
+    """A function of the state at the nodes, shape (*grid)."""
+    nodes = grid.nodes().reshape(-1, grid.ndim)
+    return np.asarray(jax.vmap(function)(nodes), float).reshape(grid.shape)
+
+
+def sizes_of(found: Defects, lead: np.ndarray, sign: int) -> np.ndarray:
+    """The shift that every cell requires, (*cells): its defect, or the lead if that is smaller."""
+    return np.minimum(found.high if sign > 0 else -found.low, lead)
+
+
+def _no_bound(grid: Grid, found: Defects, sign: int) -> str:
+    """The message for a defect that is not bounded, with the first such cell."""
+    sizes = found.high if sign > 0 else -found.low
+    index = np.unravel_index(int(np.argmax(~np.isfinite(sizes))), sizes.shape)
+    nodes = [np.append(np.asarray(grid.axis(k)), grid.hi[k]) for k in range(grid.ndim)]
+    state = [float(nodes[k][i]) for k, i in enumerate(index)]
+    return (
+        f"enclose: the {'lower' if sign > 0 else 'upper'} bound is infinite: drift, cost or 1/discount is not bounded\n"
+        f"in the cell at x = {np.round(state, 4).tolist()}. Functions must be finite and Lipschitz on the whole box,\n"
+        "and controls bounded unless the cost is quadratic in them"
+    )

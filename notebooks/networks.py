@@ -64,4 +64,4 @@ axes[0].legend()
 axes[1].semilogy(25 * np.arange(len(solution.history)), solution.history)
 axes[1].set(xlabel="step", ylabel="held-out error")
 plt.show()
-assert np.max(np.abs(found / reference - 1)) < 0.05
+assert np.max(np.abs(found / reference - 1)) < 0.02

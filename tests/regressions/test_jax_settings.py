@@ -222,7 +222,7 @@ def check(door, setting, settings):
 def paired(pair):
     """A door and a setting; some pairs run for long."""
     dear = pair[0] == "simulate" and pair[1] in ("debug_nans", "debug_infs")
-    dear |= pair[0] == "hinf_level" and pair[1] != "64_bits"
+    dear |= pair[0] == "hinf_level"
     dear |= pair[0] == "jit and grad" and pair[1] not in ("debug_nans", "64_bits", "no_jit")
     return pytest.param(*pair, marks=[pytest.mark.slow] * dear)
 

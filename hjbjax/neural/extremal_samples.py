@@ -15,7 +15,9 @@ from hjbjax.solution.clock import Clock
 from hjbjax.solution.solution import SolveError
 
 POINTS = 32  # per extremal, at equal distances along it in units of the box
-TOL = 1e-5  # of an extremal: its cost is exact to about 1e-8, and it takes a sixth of the time of one with 1e-8
+# Of an extremal. Its nodes are the data: with 1e-5 it takes a sixth of the time, but a satellite's closed loop then
+# costs up to 2.9 % more than the extremals, with twice as many of them, instead of at most 2 %.
+TOL = 1e-8
 
 
 @dataclasses.dataclass

@@ -378,7 +378,7 @@ def test_a_satellite_turns_as_cheaply_as_its_extremals():
 
     problem = hjb.Problem(drift, cost, hjb.Box([-20.0] * 3, [20.0] * 3))
     corner = np.array([0.8] * 3 + [1.0] * 3)
-    found = neural.solve(problem, -corner, corner, seed=0, steps=5000, extremals=96, held_out=104)
+    found = neural.solve(problem, -corner, corner, seed=0, held_out=104)
     assert found.validation["failed"] <= 10
     assert abs(found.validation["excess_cost"]) < 0.02
     assert found.validation["worst_excess"] < 0.02

@@ -179,7 +179,9 @@ def test_the_seed_repeats_it(diffusion):
 @pytest.mark.slow
 def test_a_guess_continues(diffusion):
     further = neural.deep_bsde(noisy(), START, 1.0, guess=diffusion, **STOCHASTIC | {"steps": 25})
-    assert abs(further.history[0] / min(diffusion.history) - 1) < 0.02  # the offset at the start has changed
+    # a little more than the least loss, because V at the start was set to the estimate after the training
+    assert 0.98 < further.history[0] / min(diffusion.history) < 1.05
+    assert further.history[0] < 0.25 * diffusion.history[0]
 
 
 @pytest.mark.parametrize("method", ["fit", "deep_bsde"])

@@ -243,8 +243,9 @@ def _prepare_jit(on: Discretisation, method: Method, tol: Number, *, assumptions
 
     marks: Any = None
     if layout.axes:
-        whole = jax.eval_shape(functools.partial(prepare, assumptions=assumptions), on, method=method, tol=tol)
-        marks = whole.over_nodes(on.grid.shape)
+        # traced inside shard_map here too: constants of the user's functions are cached, and belong to its mesh
+        part = jax.eval_shape(layout.mapped(here, False, False), on, method, tol)
+        marks = part.over_nodes(layout.shape)
     return layout.mapped(here, False, marks)(on, method, tol)
 
 

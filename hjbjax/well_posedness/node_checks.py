@@ -200,7 +200,10 @@ def _actions_pass(
     on: Discretisation, actions: tuple[Array, Array], first: int | Scalar, last: int | Scalar, *, layout: Layout
 ) -> Verdict:
     """``_part_passes`` for the nodes of all devices."""
-    here: Callable[..., Verdict] = lambda on, *arguments: _part_passes(on.on_part(layout), *arguments)  # noqa: E731
+
+    def here(on: Discretisation, *arguments: Any) -> Verdict:
+        return _part_passes(on.on_part(layout), *arguments)
+
     return layout.mapped(here, False, False)(on, actions, first, last)
 
 

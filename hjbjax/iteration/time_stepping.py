@@ -23,7 +23,7 @@ from hjbjax.hamiltonian.search import Action
 from hjbjax.iteration import bellman, isaacs
 from hjbjax.iteration.bellman import Obstacles
 from hjbjax.iteration.grid_task import GridTask
-from hjbjax.iteration.time_methods import TABLEAUX, Tableau, TimeMethod, longest_step
+from hjbjax.iteration.time_methods import TABLEAUX, Explicit, Tableau, TimeMethod, longest_step
 from hjbjax.problem import sets
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Box
@@ -182,6 +182,13 @@ class Seen:
 def stable(on: Discretisation, tableau: Tableau = TABLEAUX[1], share: Numbers = 1.0) -> jax.Array:
     """The longest step at the time of ``on``, see ``longest_step``, of Euler's method by default."""
     return longest_step(largest_rate(on) + _largest_decay(on), on.problem, share, tableau)
+
+
+def stable_steps(on: Discretisation, method: Explicit) -> jax.Array:
+    """The longest step of each Euler stage of an explicit method, and of the method, at the time of ``on``, (2,)."""
+    # the Euler steps inside a stage have length c Δt, and are monotone if c Δt (max Q + β) ≤ 1
+    shares = jnp.stack([jnp.asarray(share, on.dtype) for share in (1 / method.tableau.euler, method.courant)])
+    return stable(on, method.tableau, shares)
 
 
 def fastest_growth(on: Discretisation) -> Scalar:

@@ -69,7 +69,7 @@ def comparison(chain: Settled, sharp: Settled, clock: Clock) -> tuple[CoarserAns
         return first, level if isinstance(level, CoarserAnswer) else first, None
     guess = _restricted(chain, level)
     enough = max(float(level.tol), ROUGH * float(np.max(nested_grids.apart(guess, first.value))))
-    state, code = _iterated(dataclasses.replace(level, tol=jnp.asarray(enough, guess.dtype)), guess, clock)
+    state, code = _iterated(dataclasses.replace(level, tol=jnp.asarray(np.asarray(enough, guess.dtype))), guess, clock)
     if code is Status.CONVERGED:
         error = _expected_error(chain, level.grid, first.value, values_of(level, state))
         state, code = _iterated(stop_at(level, error, guess), fill_unreachable(level, state), clock)

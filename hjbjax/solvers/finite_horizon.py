@@ -55,7 +55,7 @@ FEWEST = 100  # number of steps if no stability limit is known in advance: impli
 
 RISE, RISE_GIVEN = 0.02, 0.5  # largest growth of V per step: by default, and if the caller sets implicit steps
 
-_stable = jax.jit(time_stepping.stable, static_argnames="tableau")
+_stable_steps = jax.jit(time_stepping.stable_steps)
 _fastest_growth = jax.jit(time_stepping.fastest_growth)
 _obstacles = jax.jit(bellman.obstacles)
 
@@ -355,10 +355,8 @@ def _prepare(
         # the limit at many times; otherwise the length is computed before every step.
         probes = np.linspace(horizon, 0.0, PROBES) if moving else [horizon]
         if step is not None or not moving:
-            # the Euler steps inside a stage have length c Δt, and are monotone if c Δt (max Q + β) ≤ 1
-            shares = jnp.stack([jnp.asarray(share, dtype) for share in (1 / method.tableau.euler, method.courant)])
-            limits = jnp.stack([_stable(on.at(jnp.asarray(t, dtype)), method.tableau, shares) for t in probes])
-            stable, own = jnp.min(limits, axis=0)
+            limits = [np.asarray(_stable_steps(on.at(np.asarray(t, dtype)), method)) for t in probes]
+            stable, own = np.min(limits, axis=0)
             _check_step(step, float(stable))
             limit = own if step is None else stable
     looks = _checks(on, method)

@@ -37,7 +37,7 @@ FEW = 4  # steps between two kept times, below which the coarse march keeps ever
 UNSETTLED = "not estimated: the march on the coarser grid did not come to its end"
 ONE_STEP = "not estimated: the march took one step, and a coarser one cannot take fewer"
 
-_stable = jax.jit(time_stepping.stable, static_argnames="tableau")
+_stable_steps = jax.jit(time_stepping.stable_steps)
 
 
 @jax.jit
@@ -217,12 +217,12 @@ def _again(
     return slices.value if code is Status.CONVERGED and np.all(np.isfinite(slices.value)) else None
 
 
-def _steps(task: March, longer: float) -> jax.Array:
+def _steps(task: March, longer: float) -> np.ndarray:
     """Steps longer by a factor, except steps that were shortened to resolve functions of time."""
-    step = jnp.asarray(task.step)
+    step = np.asarray(task.step)
     if step.ndim == 0:
         return longer * step
-    return jnp.where(step < float(task.horizon) / time_probes.PARTS * (1 - 1e-6), step, longer * step)
+    return np.where(step < float(task.horizon) / time_probes.PARTS * (1 - 1e-6), step, longer * step)
 
 
 def _limit(task: March, on: Discretisation) -> Number | None:
@@ -236,13 +236,13 @@ def _limit(task: March, on: Discretisation) -> Number | None:
     fine, coarse = task.grid, on.grid
     different = any(getattr(task.problem, name) is not None for name in ("target", "killing", "growth"))
     if different or any(a == b for a, b in zip(fine.shape, coarse.shape, strict=True)):
-        return _stable(on, tableau, jnp.asarray(task.method.courant, on.dtype))
+        return np.asarray(_stable_steps(on, task.method))[1]
     ratio, limit, share = nested_grids.ratio_of(fine, coarse), float(task.limit), float(task.method.courant)
     if beta == 0 or len(tableau.means) == 1:
         rate = share / limit  # Q + β, see ``longest_step``
-        return jnp.asarray(share / ((rate - beta) / ratio + beta), on.dtype)
+        return np.asarray(share / ((rate - beta) / ratio + beta), on.dtype)
     rate = share * beta / math.expm1(beta * limit)
-    return jnp.asarray(math.log1p(beta * share / ((rate - beta) / ratio + beta)) / beta, on.dtype)
+    return np.asarray(math.log1p(beta * share / ((rate - beta) / ratio + beta)) / beta, on.dtype)
 
 
 def _highest(task: March, point: bool) -> float:

@@ -34,7 +34,6 @@ ADVICE = {
     Status.STALLED: "The policy iteration of an implicit step did not converge; use a shorter step.",
 }
 
-_terminal = jax.jit(time_stepping.terminal)
 
 # the players' actions, the nodes on the target, the nodes at which actions matter, and the sets of ``contact``
 Feedback: TypeAlias = tuple[
@@ -178,17 +177,22 @@ def drive_march(
 ) -> tuple[Slices, Front, Status]:
     """The slices at the kept times, the last front and its status; ends at a code, the time limit, or Ctrl-C."""
     start = None if start is None else jnp.asarray(start, np.dtype(task.horizon.dtype))
-    value = _terminal(task.on.at(task.horizon), start)
-    front = time_stepping.begin(task, value, horizon - kept[-1])
-    finite = bool(jnp.all(jnp.isfinite(front.value)))
+    front, finite = _front_at_horizon(task, start, horizon - kept[-1])
     run = MarchRun(task, front, kept)
-    del front, value  # free the value at the horizon, which is not needed after the first steps
-    status = host_loop.drive(run, clock) if finite else Status.NONFINITE
+    del front  # free the value at the horizon, which is not needed after the first steps
+    status = host_loop.drive(run, clock) if bool(finite) else Status.NONFINITE
     slices, front = run.slices, run.gathered()
     # after a cut nothing is compiled, and the program of the feedback exists only if a slice was kept before
     if status is not Status.CONVERGED and slices.misses(run.time) and bool(jnp.all(jnp.isfinite(front.value))):
         run.store(feedback=status not in CUT or slices.first < len(kept))  # the last time reached
     return slices, front, status
+
+
+@jax.jit
+def _front_at_horizon(task: March, start: Field | None, left: Number) -> tuple[Front, Scalar]:
+    """The front at the horizon, and true if V is finite there."""
+    value = time_stepping.terminal(task.on.at(task.horizon), start)
+    return time_stepping.begin(task, value, left), jnp.all(jnp.isfinite(value))
 
 
 class MarchRun:
@@ -216,7 +220,7 @@ class MarchRun:
         """The current time of the march."""
         if self._is_kept:
             return float(self.slices.times[self.slices.first])
-        left, rest = (float(number) for number in self.front.left)
+        left, rest = (float(number) for number in np.asarray(self.front.left))
         return float(self.slices.times[self.slices.first - 1]) + left + rest if self.slices.first else 0.0
 
     @property
@@ -248,7 +252,7 @@ class MarchRun:
     def between(self, status: Status, clock: Clock) -> Status:
         """Store the slices at the times that the front has reached; CONVERGED after the last of them."""
         slices = self.slices
-        while status is Status.RUNNING and slices.first > 0 and float(self.front.left[0]) <= 0:
+        while status is Status.RUNNING and slices.first > 0 and float(np.asarray(self.front.left)[0]) <= 0:
             if not self._is_kept:
                 cut = clock.over()
                 # at the last kept time the march is complete, so a time limit that passes now is ignored
@@ -263,7 +267,7 @@ class MarchRun:
     def _is_kept(self) -> bool:
         """True if the front is at the last slice, because an interrupt came before its clock was reset."""
         times, first = self.slices.times, self.slices.first
-        at_end = float(self.front.left[0]) <= 0 and first < len(times)
+        at_end = float(np.asarray(self.front.left)[0]) <= 0 and first < len(times)
         return at_end and self.slices.value.dtype.type(times[first]) == np.asarray(self.front.t)
 
     def _clock(self, left: float) -> Any:

@@ -39,10 +39,10 @@ def sharpened(task: Task, *, first: bool = False) -> Task:
     """
     obstacles, shift = task.obstacles, None
     if task.floor is not None:
-        floor = jnp.finfo(task.tol.dtype).min / 8 if first else task.floor
-        obstacles = dataclasses.replace(obstacles, lower=jnp.asarray(floor, task.tol.dtype))
+        floor = np.finfo(task.tol.dtype).min / 8 if first else task.floor
+        obstacles = dataclasses.replace(obstacles, lower=jnp.asarray(np.asarray(floor, task.tol.dtype)))
     if task.crossing is not None and task.problem.noise is None and not task.problem.is_game:
-        shift = jnp.asarray(0 if first else AHEAD / task.crossing, task.tol.dtype)
+        shift = np.asarray(0 if first else AHEAD / np.asarray(task.crossing), task.tol.dtype)
     return dataclasses.replace(task, obstacles=obstacles, shift=shift, weights=np.array([1, 0], task.tol.dtype))
 
 

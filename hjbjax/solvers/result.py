@@ -180,7 +180,7 @@ def _highest(settled: Settled) -> float:
 
 def _left(solution: Solution, settled: Settled, error: np.ndarray) -> np.ndarray:
     """The algebraic error of the iteration, cost units, (*grid), for an estimate ``error`` of the grid's."""
-    known = float(settled.state.progress.best[0]) if solution.error is None else float(solution.error)
+    known = float(np.asarray(settled.state.progress.best)[0]) if solution.error is None else float(solution.error)
     left = min(known, float(settled.task.tol))
     if solution.error is None and settled.task.weights is not None:
         return remaining_error(settled.task, left, error)
@@ -396,7 +396,7 @@ def _message(code: Status, task: Task, state: State, grid: Grid) -> str:
     if code is Status.NONFINITE:
         return _not_finite_message(task, state, grid)
     # the certificates that do not bound the error cannot promise that a smaller tolerance is within reach
-    best, tol = float(state.progress.best[0]), float(task.tol)
+    best, tol = float(np.asarray(state.progress.best)[0]), float(task.tol)
     certified = task.certificate not in (Certificate.NONE, Certificate.RESIDUAL, Certificate.OPEN)
     if code is Status.STALLED and np.isfinite(best) and certified:
         return within_reach(best)

@@ -291,7 +291,7 @@ def finish_arcs(followed: Followed) -> Solution:
     leaving = None if code in CUT or not looked else _leaving(on, value, policy, task)
     policy[~counted | np.asarray(task.obstacles.ended) | (not looked)] = np.nan
     touching = {} if leaving is None else jax.device_get(contact(problem, on.grid, task.obstacles, value))
-    best = float(state.progress.best[0])
+    best = float(np.asarray(state.progress.best)[0])
     message = within_reach(best) if code is Status.STALLED and np.isfinite(best) else problem.labels.word(code.message)
     solution = solution_at_start(on, value, code)
     solution = dataclasses.replace(

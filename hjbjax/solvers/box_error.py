@@ -169,15 +169,24 @@ def _other_free_ends(level: Task) -> tuple:
 def _coarse_task(task: Task) -> Task | None:
     """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
     level = dataclasses.replace(task, on=task.on.chain)
-    wanted = int(np.clip(task.grid.size // SHARE, FEWEST, MOST))
-    while level.grid.size > wanted:
-        coarse = nested_grids.coarser(level.grid, INTERVALS)
-        smaller = None if coarse is None else on_coarser(level, coarse)
-        if smaller is None:
+    finer = _coarser_grids(task.grid, int(np.clip(task.grid.size // SHARE, FEWEST, MOST)))
+    while finer:
+        coarse = on_coarser(level, finer.pop())
+        if coarse is not None:
+            level = coarse
             break
-        level = smaller
     fits = level.grid.size <= FACTORED and level.grid.ndim < 6
     return dataclasses.replace(level, mesh=None) if fits else None
+
+
+def _coarser_grids(grid: Grid, wanted: int) -> list[Grid]:
+    """Ever coarser grids; the number of nodes of the last is closest to ``wanted``, as a ratio."""
+    grids = [grid]
+    while grids[-1].size > wanted and (coarse := nested_grids.coarser(grids[-1], INTERVALS)) is not None:
+        if coarse.size * grids[-1].size < wanted**2:
+            break
+        grids.append(coarse)
+    return grids[1:]
 
 
 def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:

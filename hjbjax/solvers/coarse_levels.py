@@ -129,7 +129,9 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
         bare: Any = dataclasses.replace(task, on=None, obstacles=obstacles)  # type: ignore[arg-type]
         known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
         on = task.on.on_grid(coarse)
-        made = dataclasses.replace(known, on=_with_links(on) if stores_links(on) else on)
+        if stores_links(on):  # those of the chain, which its own level on this grid needs too
+            on = _with_links(on.chain).with_scheme(on.scheme)
+        made = dataclasses.replace(known, on=on)
     elif task.has_lost:  # whether nodes in between reach the target is not known
         return None
     else:

@@ -5,6 +5,8 @@ earlier ones.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,11 +24,13 @@ from hjbjax.tracing.intervals import point
 SMOOTHING = 3  # defect corrections before the bounds part
 WIDENED = 5.0  # the level of a correction is the largest defect divided by this number
 FALLS = 0.7  # a defect correction must reduce the mean defect to this fraction
-HELPS = 0.6  # a correction along the paths that leaves more than this fraction of the shift is compared with another
+HELPS = 0.7  # a correction along the paths that leaves more than this fraction of the shift is compared with another
 STAGNANT = 2  # corrections without progress after which a bound is given up
 BISECTIONS = 2  # of the cells with the largest defects
 LARGEST = 0.5  # fraction of the largest defect from which on a cell is bisected
+WORTH = 0.97  # no cell is bisected if those below leave more than this fraction of the shift
 GAIN = 0.97  # a correction that leaves more than this fraction of the width is no progress
+Move = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,17 +57,18 @@ class DiscountTask:
         """The defects of the spline with these coefficients."""
         return defect.defects(self.spline, self.known, values)
 
-    def move(self, found: Defects, source: np.ndarray) -> np.ndarray:
-        """The correction of the coefficients by a source at the nodes, relative to the discount."""
+    def mover(self, found: Defects) -> Move:
+        """The correction of the coefficients as a function of a source at the nodes, relative to the discount."""
         rates, weights = self.rates()
-        return self.solve(found, rates, weights * source)
+        solve = functools.cache(lambda: self.solver(found, rates))  # not needed if the defect is unbounded
+        return lambda source: solve()(weights * source)
 
-    def solve(self, found: Defects, rates: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """The solution E of (β − L^π) E = source at the nodes, where π is the control that is optimal for W."""
+    def solver(self, found: Defects, rates: np.ndarray) -> Move:
+        """The solution E of (β − L^π) E = s as a function of s, where π is the control that is optimal for W."""
         policy = np.stack(
             [correction.on_nodes(found.policy[..., j], self.grid) for j in range(found.policy.shape[-1])], axis=-1
         ) if found.policy.shape[-1] else None  # fmt: skip
-        return correction.solver(self.problem, self.grid, policy, rates)(source)
+        return correction.solver(self.problem, self.grid, policy, rates)
 
     def remaining(self, upper: Bound) -> np.ndarray:
         """The influence of the projected ends, see ``Enclosure.remaining``."""
@@ -87,26 +92,29 @@ class DiscountTask:
         middle = (found.low + found.high) / 2
         return middle if np.all(np.isfinite(middle)) else None
 
-    def corrected(self, values: np.ndarray) -> tuple[np.ndarray, Defects]:
-        """The coefficients after defect corrections, as long as the mean defect falls, and their defects."""
+    def corrected(self, values: np.ndarray) -> tuple[np.ndarray, Defects, Move]:
+        """The coefficients after defect corrections, as long as the mean defect falls, their defects, and ``mover``.
+
+        The control hardly changes, so the equations of all corrections are factored once.
+        """
         values, nodes = self.continued(values), self.grid.nodes().reshape(-1, self.grid.ndim)
         # a spline with the node values as its coefficients is too smooth
         smoothed = self.spline.at(nodes).values(values).lo.reshape(self.grid.shape)
         values = self.continued(2 * values - smoothed)
         found = self.defects(values)
-        middle = self.middle(found)
+        middle, move = self.middle(found), self.mover(found)
         for _ in range(SMOOTHING):
             if middle is None:
                 break
-            changed = self.continued(values - self.move(found, correction.on_nodes(middle, self.grid)))
+            changed = self.continued(values - move(correction.on_nodes(middle, self.grid)))
             after = self.defects(changed)
             remains = self.middle(after)
             if remains is None or not np.mean(np.abs(remains)) < FALLS * np.mean(np.abs(middle)):
                 break
             values, found, middle = changed, after, remains
-        return values, found
+        return values, found, move
 
-    def bound(self, values: np.ndarray, found: Defects, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
+    def bound(self, values: np.ndarray, found: Defects, move: Move, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
         """The best bound after corrections, and the shift that the cell around each node requires without them.
 
         Raises:
@@ -115,8 +123,9 @@ class DiscountTask:
         kept: list[tuple[np.ndarray, float]] = []
         best, stagnant = np.full(self.grid.shape, -np.inf), 0
         required = np.zeros(self.grid.shape)
-        for _ in range(rounds):
-            lead = self.lead(values, kept, sign)
+        lead = self.lead(values, kept, sign)
+        for turn in range(rounds):
+            before = float(np.max(sizes_of(found, lead, sign)))
             found = self.bisected(values, found, lead, sign)
             sizes = sizes_of(found, lead, sign)
             shift = float(np.max(sizes))
@@ -124,16 +133,16 @@ class DiscountTask:
                 break
             if not kept:
                 required = correction.on_nodes(sizes, self.grid, np.max)
-            before = np.mean(best[self.chosen])
+            mean = np.mean(best[self.chosen])
             best = np.maximum(best, sign * values - shift)
             kept.append((values, shift))
             # progress is measured by the part of the width that one more correction may win
-            gain = np.mean(best[self.chosen]) - before
+            gain = np.mean(best[self.chosen]) - mean
             stagnant = 0 if gain > (1 - GAIN) * max(shift, self.wanted) else stagnant + 1
-            if shift <= self.wanted / 4 or stagnant >= STAGNANT:
+            if shift <= self.wanted / 4 or stagnant >= STAGNANT or turn == rounds - 1:
                 break
             excess = correction.on_nodes(np.maximum(sizes - shift / WIDENED, 0), self.grid)
-            values, found = self.better(values, found, excess, kept, sign)
+            values, found, lead, move = self.better(values, found, excess, move, kept, sign, min(HELPS * before, shift))
         if not kept:
             raise ValueError(_no_bound(self.grid, found, sign))
         coefficients, shifts = zip(*kept, strict=True)
@@ -148,25 +157,25 @@ class DiscountTask:
         return found
 
     def better(
-        self, values: np.ndarray, found: Defects, excess: np.ndarray, kept: list[tuple[np.ndarray, float]], sign: int
-    ) -> tuple[np.ndarray, Defects]:
-        """A correction for an excess at the nodes, and its defects.
+        self, values: np.ndarray, found: Defects, excess: np.ndarray, move: Move,
+        kept: list[tuple[np.ndarray, float]], sign: int, enough: float,
+    ) -> tuple[np.ndarray, Defects, np.ndarray, Move]:  # fmt: skip
+        """A correction for an excess at the nodes, its defects, its lead, and the function for the next correction.
 
-        It follows the paths. If this does not help, the better of it and of a bump at the nodes themselves: at a kink
-        that paths leave, the spline has an extremum, where the motion does not count and W must be the value of resting
-        there.
+        It follows the paths. If this leaves a shift above ``enough``, the best of it, of the same under the present
+        control, and of a bump at the nodes themselves: at a kink that paths leave, the spline has an extremum, where
+        the motion does not count and W must be the value of resting there.
         """
-        options: list[tuple[float, np.ndarray, Defects]] = []
-        for move in (lambda: self.move(found, correction.smooth_cover(excess, self.grid)), lambda: excess):
-            option = values - sign * move()
-            after = self.defects(option)
-            sizes = sizes_of(after, self.lead(option, kept, sign), sign)
-            shift = float(np.max(sizes))
-            options.append((float(np.mean((sign * option)[self.chosen])) - shift, option, after))
-            if shift < HELPS * kept[-1][1]:
+        options: list[tuple[float, np.ndarray, Defects, np.ndarray, Move]] = []
+        along, fresh = correction.smooth_cover(excess, self.grid), self.mover(found)
+        for step, used in ((lambda: move(along), move), (lambda: fresh(along), fresh), (lambda: excess, fresh)):
+            option = values - sign * step()
+            after, lead = self.defects(option), self.lead(option, kept, sign)
+            shift = float(np.max(sizes_of(after, lead, sign)))
+            options.append((float(np.mean((sign * option)[self.chosen])) - shift, option, after, lead, used))
+            if shift < enough:
                 break
-        _, option, after = max(options, key=lambda each: each[0])
-        return option, after
+        return max(options, key=lambda each: each[0])[1:]
 
     def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
         """The defects with the cells that determine the shift cut into parts, at most one in ten."""
@@ -175,6 +184,8 @@ class DiscountTask:
             if not np.all(np.isfinite(sizes)):
                 break
             level = max(LARGEST * np.max(sizes), np.quantile(sizes, 0.9))
+            if level > WORTH * np.max(sizes):  # the shift hardly falls, because other cells require almost the same
+                break
             chosen = sizes >= level
             # where the range of the defect is narrow, its largest value is already known
             chosen &= found.high - found.low > 0.2 * np.abs(sizes)

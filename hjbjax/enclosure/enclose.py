@@ -93,8 +93,8 @@ def enclose(
             task = DiscountTask(own, grid, spline, blocks, scale * tol, chosen)
         else:
             task = exit_task(own, grid, spline, value, chosen, scale * tol)
-        middle, found = task.corrected(value)
-        bounds = [task.bound(middle, found, sign, count) for sign in (1, -1)]
+        middle, found, move = task.corrected(value)
+        bounds = [task.bound(middle, found, move, sign, count) for sign in (1, -1)]
         remaining = task.remaining(bounds[1][0])
     if problem.payoff == REWARD:
         bounds = [(each.negative(), sizes) for each, sizes in reversed(bounds)]

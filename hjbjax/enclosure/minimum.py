@@ -253,35 +253,60 @@ def norm(b: Sequence[Form]) -> Form:
 
 def least_quadratic(b: Form, c: Form, lo: float, hi: float) -> tuple[Form, Interval, np.ndarray]:
     """The minimum of b u + c u² over lo ≤ u ≤ hi, the range of the minimiser, and a minimiser at the centre."""
+    whole, near = minimisers(b.range, c.range, lo, hi), minimisers(b.centre, c.centre, lo, hi)
+    zero = point(0.0)
+
+    def of(slope: Interval) -> Interval:
+        return whole if slope is b.range else near
 
     def function(slope: Interval, curvature: Interval) -> Interval:
-        # concave in the slope and increasing in the curvature: least at ends of both
-        low = [_lower_bound(end, curvature.lo, lo, hi) for end in slope.ends]
-        u = minimisers(slope, curvature, lo, hi)
-        tried = [each for each in (u.lo, u.hi, (u.lo + u.hi) / 2) if np.all(np.isfinite(each))]
-        high = [(slope * point(u) + curvature * iv.squared(point(u))).hi for u in tried]
-        most = np.minimum.reduce(high) if high else np.full(np.shape(low[0]), np.inf)
-        return Interval(np.minimum(*low), most)
+        return _least_value(slope, curvature, of(slope), lo, hi)
 
     def derivatives(slope: Interval, curvature: Interval) -> tuple[Interval, Interval]:
-        u = minimisers(slope, curvature, lo, hi)
-        return u, iv.squared(u)
+        return of(slope), iv.squared(of(slope)) if c.slopes else zero  # a constant needs no derivative
 
     def seconds(slope: Interval, curvature: Interval) -> tf.Curvature:
-        u = minimisers(slope, curvature, lo, hi)
-        free = -(slope / curvature.scaled(2.0))
-        inside, outside = (free.lo > lo) & (free.hi < hi), (u.lo == u.hi)
-        zero = point(0.0)
+        inside, outside = (whole.lo > lo) & (whole.hi < hi), (whole.lo == whole.hi)
         response = -(point(0.5) / curvature)  # of the minimiser to the slope, where it is inside
         response = iv.where(inside, response, iv.union(response, zero))
         # without curvature the minimiser jumps from one end to the other
         response = iv.where(curvature.lo > 0, response, iv.entire(response))
         response = iv.where(outside & ~inside, zero, response)
-        return {(0, 0): response, (0, 1): (response * u).scaled(2.0), (1, 1): (response * iv.squared(u)).scaled(4.0)}
+        if not c.slopes:
+            return {(0, 0): response}
+        return {
+            (0, 0): response, (0, 1): (response * whole).scaled(2.0), (1, 1): (response * iv.squared(whole)).scaled(4.0)
+        }  # fmt: skip
 
-    at_centre = minimisers(b.centre, c.centre, lo, hi)
-    middle = np.clip(np.nan_to_num((at_centre.lo + at_centre.hi) / 2), lo, hi)
-    return tf.apply(function, derivatives, seconds, b, c), minimisers(b.range, c.range, lo, hi), middle
+    return tf.apply(function, derivatives, seconds, b, c), whole, _middle(near, lo, hi)
+
+
+def _middle(u: Interval, lo: float, hi: float) -> np.ndarray:
+    """A number between the ends of an interval and between two numbers."""
+    return np.clip(np.nan_to_num((u.lo + u.hi) / 2), lo, hi)
+
+
+def _least_value(slope: Interval, curvature: Interval, minimiser: Interval, lo: float, hi: float) -> Interval:
+    """The range of the minimum of b u + c u² over lo ≤ u ≤ hi.
+
+    Let v be admissible and g = b + 2 c v. For c ≥ 0 the polynomial exceeds its value at v by g (u − v) + c (u − v)².
+    This is at least −s²/(4c) and −s |u − v|, where s is the part of |g| whose sign allows a decrease.
+    """
+    at = _middle(minimiser, lo, hi)
+    u = point(at)
+    value = slope * u + curvature * iv.squared(u)
+    gradient = slope + (curvature * u).scaled(2.0)
+    falls = np.maximum(np.where(at <= lo, 0.0, gradient.hi), np.where(at >= hi, 0.0, -gradient.lo))
+    decrease = point(np.maximum(falls, 0.0))
+    span = np.maximum((point(np.asarray(hi)) - u).hi, (u - point(np.asarray(lo))).hi)
+    loss = np.minimum((decrease * point(span)).hi, (iv.squared(decrease) / point(curvature.lo).scaled(4.0)).hi)
+    low = (point(value.lo) - point(np.where(decrease.lo > 0, loss, 0.0))).lo
+    if not np.all(curvature.lo >= 0):
+        # increasing in c, and for c < 0 least at an end
+        ends = [(slope * point(end) + point(curvature.lo) * iv.squared(point(end))).lo for end in (lo, hi)]
+        least = np.minimum(*ends)
+        low = np.where(curvature.lo >= 0, low, np.where(np.isfinite(least), least, -np.inf))
+    return Interval(low, value.hi)
 
 
 def minimisers(slope: Interval, curvature: Interval, lo: float, hi: float) -> Interval:
@@ -297,19 +322,6 @@ def minimisers(slope: Interval, curvature: Interval, lo: float, hi: float) -> In
     found = iv.where(curvature.lo > 0, inside, Interval(low.lo, high.lo))
     found = iv.where(convex & at_low, low, found)
     return iv.where(convex & at_high, high, found)
-
-
-def _lower_bound(slope: np.ndarray, curvature: np.ndarray, lo: float, hi: float) -> np.ndarray:
-    """A lower bound of the minimum of b u + c u² for numbers b and c."""
-    b, c = point(slope), point(curvature)
-    ends = [(b * point(end) + c * iv.squared(point(end))).lo for end in (lo, hi)]
-    with np.errstate(all="ignore"):
-        free = (-(iv.squared(b) / (c.scaled(4.0)))).lo  # −b²/4c, the minimum over all u
-    u = minimisers(b, c, lo, hi)
-    at_end = (u.hi <= lo) | (u.lo >= hi) | (curvature <= 0)
-    least_end = np.minimum(*ends)
-    # a convex polynomial whose minimiser is an end; a concave one is least at an end as well
-    return np.where(at_end & np.isfinite(least_end), least_end, np.where(curvature > 0, free, -np.inf))
 
 
 def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:

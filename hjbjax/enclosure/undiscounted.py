@@ -17,7 +17,7 @@ import numpy as np
 from hjbjax.enclosure import correction, defect, walls
 from hjbjax.enclosure.bounds import Bound
 from hjbjax.enclosure.defect import Defects
-from hjbjax.enclosure.discounted import BISECTIONS, STAGNANT, WIDENED, DiscountTask, at_nodes
+from hjbjax.enclosure.discounted import BISECTIONS, STAGNANT, WIDENED, DiscountTask, Move, at_nodes
 from hjbjax.enclosure.exits import DEPTH, Exit, exit_of
 from hjbjax.enclosure.interpolant import Spline
 from hjbjax.enclosure.levels import Levels, levels_of
@@ -92,7 +92,7 @@ class ExitTask(DiscountTask):
         ratio = correction.nearest_known(ratio, clear, self.grid)
         return np.where(self.blank, self.paid + ratio * self.level, values)
 
-    def bound(self, values: np.ndarray, found: Defects, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
+    def bound(self, values: np.ndarray, found: Defects, move: Move, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
         """The best bound after corrections, and the relative defect of the cell around each node without them.
 
         Raises:
@@ -125,7 +125,7 @@ class ExitTask(DiscountTask):
             else:
                 excess = np.where(lifted, 0.0, correction.on_nodes(np.maximum(sizes, 0.0), self.grid))
                 excess = np.maximum(excess - np.max(excess) / WIDENED, 0.0)
-                base = base - sign * self.move(policy, correction.smooth_cover(excess, self.grid))
+                base = base - sign * move(correction.smooth_cover(excess, self.grid))
             values = base - sign * self.lift(policy, lifted, base)
             found = self.defects(values)
         if not kept:
@@ -195,7 +195,7 @@ class ExitTask(DiscountTask):
         if not np.any(lifted):
             return np.zeros(self.grid.shape)
         rates = np.where(lifted, HELD * self.leak, self.rates()[0])
-        return LIFT * float(np.ptp(values)) * np.clip(self.solve(found, rates, rates * lifted), 0.0, 1.0)
+        return LIFT * float(np.ptp(values)) * np.clip(self.solver(found, rates)(rates * lifted), 0.0, 1.0)
 
 
 def exit_task(

@@ -86,8 +86,8 @@ class FixedPoint:
         # divided like the equation, so that ∂Φ/∂V = −(I − W); the derivative of the divisor would be multiplied by r =
         # 0
         phi = jnp.where(obstacles.fixed, 0, rate) / jnp.where(outflow > 0, outflow, 1)
-        for constraint in _constraints(obstacles, value):
-            phi = jnp.where(_is_constraint(value, constraint), constraint - value, phi)
+        for here, constraint in _active_constraints(obstacles, value):
+            phi = jnp.where(here, constraint - value, phi)
         return jnp.where(obstacles.fixed, obstacles.fixed_value - value, phi)
 
 
@@ -162,8 +162,8 @@ def _rests_unheld(question: FixedPoint, actions: Actions, value: Field) -> jax.A
     """
     on, obstacles = jax.lax.stop_gradient((question.on, question.obstacles))
     rests = (jump_rates(on, *actions).total() + on.decay <= 0) & ~obstacles.fixed
-    for constraint in _constraints(obstacles, value):
-        rests &= ~_is_constraint(value, constraint)
+    for here, _ in _active_constraints(obstacles, value):
+        rests &= ~here
     return rests
 
 
@@ -273,30 +273,31 @@ def _tied_to_constraints(equation: PolicyEquation, obstacles: Obstacles, value: 
     Where continuing is as good as the constraint, both branches hold. On a plateau without discount only the constraint
     has a derivative, since a policy may cycle there indefinitely.
     """
+    active = [here for here, _ in _active_constraints(obstacles, value)]
     free = jnp.ones(value.shape, bool)
-    for constraint in _constraints(obstacles, value):
-        free &= ~_is_constraint(value, constraint)
+    for here in active:
+        free &= ~here
     # a row without weights reads δ = s, the derivative of the constraint
     weights = equation.weights.scaled(jnp.where(free, 1, 0))
-    weights = with_interventions(weights, obstacles.interventions, _interventions(obstacles, value))
+    interventions = obstacles.interventions
+    goes = active[len(active) - len(interventions.offsets) :]
+    weights = with_interventions(weights, interventions, [jnp.logical_and(here, ~obstacles.fixed) for here in goes])
     return dataclasses.replace(equation, weights=weights)
 
 
-def _interventions(obstacles: Obstacles, value: Field) -> list[jax.Array]:
-    """The nodes of every intervention: V is the value after this intervention, and no other bound."""
-    left, found = ~obstacles.fixed, []
-    for constraint in (obstacles.upper, obstacles.lower):
-        if constraint is not None:
-            left &= ~_is_constraint(value, constraint)
-    for after in obstacles.interventions.after(value):
-        found.append(left & _is_constraint(value, after))
-        left = left & ~found[-1]
+def _active_constraints(obstacles: Obstacles, value: Field) -> list[tuple[Mask, Field]]:
+    """The bounds on V at the nodes, each with the nodes at which V equals it: at most one bound per node.
+
+    The interventions come last, in their order. Two of them may be equally good, such as a push before and after a
+    change of the mode; the row and the right-hand side of the linear system must then belong to the same one.
+    """
+    given = [each for each in (obstacles.lower, obstacles.upper) if each is not None]
+    left = jnp.ones(value.shape, bool)
+    found: list[tuple[Mask, Field]] = []
+    for constraint in (*given, *obstacles.interventions.after(value)):
+        here = left & _is_constraint(value, constraint)
+        left, found = left & ~here, [*found, (here, constraint)]
     return found
-
-
-def _constraints(obstacles: Obstacles, value: Field) -> list[Field]:
-    """The bounds on V at the nodes, from above and then from below."""
-    return [each for each in (obstacles.ceiling(value), obstacles.lower) if each is not None]
 
 
 def _is_constraint(value: Field, constraint: Field) -> jax.Array:

@@ -15,7 +15,7 @@ from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.status import Status
 from hjbjax.solvers.coarse_levels import CoarserAnswer
 from hjbjax.solvers.order import at_order
-from hjbjax.solvers.setup import Assumptions, forced_only, linear_solve
+from hjbjax.solvers.setup import Assumptions, forced_only
 from hjbjax.solvers.stationary_run import iterate
 from hjbjax.solvers.vanishing_discounts import FURTHER, follow, needs_a_way, warm
 from hjbjax.well_posedness import resting
@@ -87,8 +87,7 @@ def settle(task: Task, assumptions: Assumptions, reached: Mask | None, guess: No
     evaluation = task.method.evaluation
     # sweeps follow the drift from the target; on a cycle no node is first, and with β Δt ≪ 1 they take 1/(β Δt) rounds
     if code is Status.STALLED and evaluation is not None and evaluation.rough:
-        solver = linear_solve(task.grid) if task.mesh is None else Krylov()
-        task = dataclasses.replace(task, method=PolicyIteration(solver))
+        task = dataclasses.replace(task, method=PolicyIteration(Krylov()))
         state, code, residuals = iterate(task, state.value, clock)
     if code in FAILED:
         try:

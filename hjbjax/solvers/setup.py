@@ -66,21 +66,21 @@ def choose(
     converges to the right one of many fixed points.
     """
     if method is not None:
-        return method.filled(choose_evaluation(problem, grid, traced=traced, divided=divided))
+        return method.filled(choose_evaluation(problem, grid, divided=divided))
     # a policy that waits at ψ or g at no cost solves its own linear equation with any value
     if is_constrained(problem) and is_discounted(problem) is False:
         return ValueIteration()
-    method = PolicyIteration(choose_evaluation(problem, grid, traced=traced, divided=divided))
+    method = PolicyIteration(choose_evaluation(problem, grid, divided=divided))
     # from a cold start a good policy advances by one cell per improvement: N of them on one grid, a few on nested
     # grids; on the zoo's pendulum with 400 x 401 nodes the steps of all levels took 0.2 s instead of 0.9 s
     return Nested(method, COARSEST) if grid.size > NEST and not (traced or grid.sides("open")) else method
 
 
-def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool, divided: bool = False) -> Evaluation:
+def choose_evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> Evaluation:
     """The evaluation of policies that suits a problem.
 
     If transport dominates, a few wavefront sweeps evaluate a policy well enough. With noise they are too slow and
-    precondition a Krylov method; in 1-D a direct solve is cheap. With modes information travels both ways too: saving
+    precondition a Krylov method. With modes information travels both ways too: saving
     on 500 nodes with two incomes takes 12 steps of a Krylov method, and 50 of sweeps.
     """
     if grid.sides("open"):  # sweeps do not support extrapolated values; see ``relaxed``
@@ -89,13 +89,13 @@ def choose_evaluation(problem: Problem, grid: Grid, *, traced: bool, divided: bo
     far = problem.landings is not None  # sweeps do not follow jumps of the state
     if problem.noise is None and not grid.modes and not far:
         return Sweeps(BETWEEN_PARTS) if divided and grid.size > MANY else Sweeps()
-    return Krylov() if traced or divided or grid.modes or far else linear_solve(grid)
+    return Krylov()
 
 
 def march_evaluation(problem: Problem, grid: Grid, *, divided: bool = False) -> Evaluation:
     """The evaluation of policies in an implicit step that suits the problem."""
     if grid.sides("open"):
-        return choose_evaluation(problem, grid, traced=False, divided=divided)
+        return choose_evaluation(problem, grid, divided=divided)
     # sweeps follow the drift and are slow if noise spreads information in both directions
     return Sweeps() if problem.noise is None and problem.landings is None else Krylov()
 
@@ -127,11 +127,6 @@ def _central(on: Discretisation) -> jax.Array:
     """True if central differences are monotone at all nodes, for every action."""
     on = cast(on, on.dtype)
     return jnp.all(jnp.stack([jnp.all(axis) for axis in on.central_nodes(on.coordinates(), on.links)]))
-
-
-def linear_solve(grid: Grid) -> Direct | Krylov:
-    """The linear solver for the evaluation of a policy if sweeps are too slow; host level."""
-    return Direct() if grid.ndim == 1 else Krylov()
 
 
 def prepare(on: Discretisation, *, method: Method, tol: Number, assumptions: "Assumptions") -> Task:

@@ -53,7 +53,12 @@ def solved(equation, grid, method_type):
 
 @pytest.mark.parametrize(
     ("n", "flags"),
-    [(1, (True,)), (2, (False, True)), pytest.param(4, (False, True, False, True), marks=pytest.mark.slow)],
+    [
+        (1, (False,)),
+        (1, (True,)),
+        (2, (False, True)),
+        pytest.param(4, (False, True, False, True), marks=pytest.mark.slow),
+    ],
 )
 @given(seed=SEEDS)
 @settings(max_examples=4)

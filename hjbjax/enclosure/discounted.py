@@ -24,10 +24,11 @@ from hjbjax.tracing.intervals import point
 SMOOTHING = 3  # defect corrections before the bounds part
 WIDENED = 5.0  # the level of a correction is the largest defect divided by this number
 FALLS = 0.7  # a defect correction must reduce the mean defect to this fraction
-HELPS = 0.7  # a correction along the paths that leaves more than this fraction of the shift is compared with another
+HELPS = 0.6  # a correction along the paths that leaves more than this fraction of the shift is compared with another
 STAGNANT = 2  # corrections without progress after which a bound is given up
 BISECTIONS = 2  # of the cells with the largest defects
 LARGEST = 0.5  # fraction of the largest defect from which on a cell is bisected
+SHARE = 0.03  # largest fraction of the cells that are bisected: their parts take as long as half of all cells
 WORTH = 0.97  # no cell is bisected if those below leave more than this fraction of the shift
 GAIN = 0.97  # a correction that leaves more than this fraction of the width is no progress
 Move = Callable[[np.ndarray], np.ndarray]
@@ -178,12 +179,12 @@ class DiscountTask:
         return max(options, key=lambda each: each[0])[1:]
 
     def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
-        """The defects with the cells that determine the shift cut into parts, at most one in ten."""
+        """The defects with the cells that determine the shift cut into parts, at most a fraction of ``SHARE``."""
         for depth in range(1, BISECTIONS + 1):
             sizes = sizes_of(found, lead, sign)
             if not np.all(np.isfinite(sizes)):
                 break
-            level = max(LARGEST * np.max(sizes), np.quantile(sizes, 0.9))
+            level = max(LARGEST * np.max(sizes), np.quantile(sizes, 1 - SHARE))
             if level > WORTH * np.max(sizes):  # the shift hardly falls, because other cells require almost the same
                 break
             chosen = sizes >= level

@@ -106,8 +106,12 @@ def outward(lo: np.ndarray, hi: np.ndarray, relative: float = 0.0, absolute: flo
     A number of size m has units in the last place of at most m · EPS, so the bounds move by a unit or more. This is
     eight times faster than ``np.nextafter``.
     """
-    lo = lo - (np.abs(lo) * (EPS + relative) + (absolute + TINY))
-    hi = hi + (np.abs(hi) * (EPS + relative) + (absolute + TINY))
+    below, above = np.abs(lo), np.abs(hi)
+    below *= EPS + relative  # in place, because new arrays take a third of the time
+    above *= EPS + relative
+    below += absolute + TINY
+    above += absolute + TINY
+    lo, hi = lo - below, hi + above
     if np.isnan(lo.sum()) or np.isnan(hi.sum()):
         lo, hi = np.where(np.isnan(lo), -np.inf, lo), np.where(np.isnan(hi), np.inf, hi)
     return Interval(lo, hi)

@@ -70,6 +70,9 @@ class Form:
     def __mul__(self, other: Form) -> Form:
         if self is other:  # narrower than the product of two unrelated factors
             return powers(self, 2)
+        for factor, one in ((self, other), (other, self)):
+            if one.range is one.centre and np.size(one.range.lo) == 1 and one.range.lo == one.range.hi == 1:
+                return factor
         return apply(operator.mul, lambda a, b: (b, a), lambda a, b: {(0, 1): _ONE}, self, other)
 
     def __truediv__(self, other: Form) -> Form:

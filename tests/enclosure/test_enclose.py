@@ -166,11 +166,14 @@ def riccati():
 
 
 @pytest.mark.slow
-def test_the_riccati_value_is_enclosed_in_the_inner_half_of_a_large_box():
-    problem, exact = riccati()
-    grid = hjb.Grid([-4.0, -4.0], [4.0, 4.0], (61, 61))
-    found = hjb.enclose(problem, hjb.solve(problem, grid))
-    assert check(found, exact, [-2.0, -2.0], [2.0, 2.0], 100_000) < 0.02
+def test_the_bounds_of_a_riccati_value_close_in_the_inner_half_of_a_large_box():
+    (problem, exact), widths = riccati(), []
+    for count in (51, 101, 201):
+        grid = hjb.Grid([-4.0, -4.0], [4.0, 4.0], (count, count))
+        found = hjb.enclose(problem, hjb.solve(problem, grid))
+        widths.append(check(found, exact, [-2.0, -2.0], [2.0, 2.0], 100_000))
+    assert np.all(np.log2(np.divide(widths[:-1], widths[1:])) > 1.5)
+    assert widths[-1] < 0.002
 
 
 def wells(x):

@@ -82,6 +82,10 @@ class Interventions:
 
     def cheapest(self, value: Field) -> Field:
         """V*, the least of ``value`` and its values after any path of interventions, (*grid)."""
+        return _cheapest(self, value)
+
+    def _paths(self, value: Field) -> Field:
+        """V* without a derivative in reverse mode."""
         if not self.pushes:
             for _ in self.costs:  # a cheapest path of changes has at most k − 1 of them
                 value = jnp.minimum(value, self.least(value))
@@ -162,6 +166,34 @@ class Interventions:
 
         start = value, jnp.ones((), bool), jnp.zeros((), jnp.int32)
         return jax.lax.while_loop(lambda carry: carry[1] & (carry[2] < most), step, start)[0]
+
+
+@jax.custom_jvp
+def _cheapest(known: Interventions, value: Field) -> Field:
+    """``known.cheapest(value)``."""
+    return known._paths(value)
+
+
+@_cheapest.defjvp
+def _cheapest_tangent(primals: Any, tangents: Any) -> tuple[Field, Field]:
+    """V* and its tangent: that of V at the end of the path of interventions, plus those of the costs on the way.
+
+    The paths are followed in a logarithmic number of steps, each twice as long as the one before: reverse mode cannot
+    repeat scans until nothing changes.
+    """
+    (known, value), (dknown, dvalue) = primals, tangents
+    best = known._paths(value)
+    after = jnp.stack(known.after(best))
+    goes, choice = best < value, jnp.argmin(after, axis=0)
+    here = jnp.arange(value.size, dtype=jnp.int32).reshape(value.shape)
+    ahead, paid = here, jnp.zeros_like(dvalue)
+    for k, (offset, cost) in enumerate(zip(known.offsets, dknown.costs, strict=True)):
+        takes = goes & (choice == k)
+        ahead, paid = jnp.where(takes, rolled(here, offset), ahead), jnp.where(takes, cost, paid)
+    ahead, paid = ahead.reshape(-1), paid.reshape(-1)
+    for _ in range(value.size.bit_length()):
+        ahead, paid = ahead[ahead], paid + paid[ahead]
+    return best, (paid + dvalue.reshape(-1)[ahead]).reshape(value.shape)
 
 
 def rolled(value: Nodes, offset: Offset) -> Field:

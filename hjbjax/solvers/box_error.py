@@ -169,9 +169,9 @@ def _other_free_ends(level: Task) -> tuple:
 def _coarse_task(task: Task) -> Task | None:
     """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
     level = dataclasses.replace(task, on=task.on.chain)
-    finer = _coarser_grids(task.grid, int(np.clip(task.grid.size // SHARE, FEWEST, MOST)))
-    while finer:
-        coarse = on_coarser(level, finer.pop())
+    grids = _coarser_grids(task.grid, int(np.clip(task.grid.size // SHARE, FEWEST, MOST)))
+    while grids:
+        coarse = on_coarser(level, grids.pop())
         if coarse is not None:
             level = coarse
             break

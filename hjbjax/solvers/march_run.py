@@ -180,7 +180,7 @@ def drive_march(
     front, finite = _front_at_horizon(task, start, horizon - kept[-1])
     run = MarchRun(task, front, kept)
     del front  # free the value at the horizon, which is not needed after the first steps
-    status = host_loop.drive(run, clock) if bool(finite) else Status.NONFINITE
+    status = host_loop.drive(run, clock) if finite else Status.NONFINITE
     slices, front = run.slices, run.gathered()
     # after a cut nothing is compiled, and the program of the feedback exists only if a slice was kept before
     if status is not Status.CONVERGED and slices.misses(run.time) and bool(jnp.all(jnp.isfinite(front.value))):

@@ -80,8 +80,8 @@ def choose_evaluation(problem: Problem, grid: Grid, *, divided: bool = False) ->
     """The evaluation of policies that suits a problem.
 
     If transport dominates, a few wavefront sweeps evaluate a policy well enough. With noise they are too slow and
-    precondition a Krylov method. With modes information travels both ways too: saving
-    on 500 nodes with two incomes takes 12 steps of a Krylov method, and 50 of sweeps.
+    precondition a Krylov method. With modes information travels both ways too: saving on 500 nodes with two incomes
+    takes 12 steps of a Krylov method, and 50 of sweeps.
     """
     if grid.sides("open"):  # sweeps do not support extrapolated values; see ``relaxed``
         small = grid.ndim < 3 and grid.size <= DIRECT and not divided

@@ -138,7 +138,9 @@ def of_two_marches(first: np.ndarray, second: np.ndarray, coarse: Grid, value: N
         return BoxError(None, FLAT)
     if np.max(change) <= ROUNDING * scale:
         return BoxError(None, NEVER_REACHED)
-    error = np.stack([nested_grids.prolong(each, coarse, fine) for each in change])
+    error = np.empty((len(change), *fine.shape), change.dtype)
+    for each, wide in zip(change, error, strict=True):  # one after the other: no second array with all times
+        wide[:] = nested_grids.prolong(each, coarse, fine)
     return BoxError(error, sides=_sides(coarse, np.max(change, axis=0) > LARGE * scale))
 
 

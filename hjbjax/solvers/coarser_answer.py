@@ -91,9 +91,11 @@ def _expected_error(chain: Settled, coarse: Grid, first: np.ndarray, second: np.
     value = values_of(task, chain.state)
     change = np.zeros(coarse.shape)
     np.subtract(second, first, out=change, where=np.isfinite(first))
-    expected = value + nested_grids.prolong(change, coarse, grid) / nested_grids.ratio_of(grid, coarse)
+    expected = nested_grids.prolong(change, coarse, grid)  # in place from here on: each array has all nodes
+    expected /= nested_grids.ratio_of(grid, coarse)
+    expected += value
     fixed = np.broadcast_to(np.asarray(task.obstacles.fixed), grid.shape)
-    expected = np.where(fixed, value, expected)
+    np.copyto(expected, value, where=fixed)
     return grid_error.estimate_on_coarse(grid_error.TwoGrids(grid, coarse, expected, second, fixed, chain=value))
 
 
@@ -112,11 +114,11 @@ def stop_at(task: Task, error: np.ndarray, value: np.ndarray) -> Task:
     return dataclasses.replace(task, weights=weights.astype(task.tol.dtype))
 
 
-def remaining_error(task: Task, left: float, error: np.ndarray) -> np.ndarray:
+def remaining_error(task: Task, left: float, error: np.ndarray) -> np.ndarray | float:
     """The error of the iteration, (*grid), for its norm ``left``; it is spread like the estimate of the grid error."""
-    largest, mean = np.asarray(task.weights, float)
+    largest, mean = np.asarray(task.weights, float).tolist()
     if mean == 0 or np.max(error) == 0:
-        return np.full(error.shape, left / largest)
+        return left / largest
     return np.minimum(left / largest, left / mean + left / largest * error / np.max(error))
 
 

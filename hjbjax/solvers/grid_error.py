@@ -20,8 +20,6 @@ estimate there is at least the range of V over two coarse cells.
 """
 
 import dataclasses
-import functools
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -69,8 +67,9 @@ class TwoGrids:
 
 
 def estimate_error(answers: TwoGrids) -> np.ndarray:
-    """Estimate |V − V_h| at the nodes, shape (*grid), in cost units; zero where V is infinite."""
-    error = nested_grids.prolong(estimate_on_coarse(answers), answers.coarse, answers.grid)
+    """Estimate |V − V_h| at the nodes, shape (*grid), in cost units and the type of V_h; zero where V is infinite."""
+    near = estimate_on_coarse(answers).astype(answers.value.dtype)
+    error = nested_grids.prolong(near, answers.coarse, answers.grid)
     error[~np.isfinite(answers.value)] = 0
     return error
 
@@ -123,12 +122,17 @@ def _along_axes(value: np.ndarray, fine: Grid, coarse: Grid) -> _Differences:
         for other in range(fine.ndim):
             line = line if other == axis else np.take(line, nested_grids.places(fine, coarse, other), axis=other)
         wide, places = _padded(line, fine, axis, np.nan, REACH), nested_grids.places(fine, coarse, axis)
-        near = [np.take(wide, places + k, axis=axis) for k in range(2 * REACH + 1)]
-        steps = [above - below for below, above in itertools.pairwise(near)]
-        bends = [above - below for below, above in itertools.pairwise(steps)]
-        first = functools.reduce(np.fmax, map(np.abs, steps), first)
-        second = functools.reduce(np.fmax, map(np.abs, bends), second)
-        extent = np.fmax(extent, functools.reduce(np.fmax, near) - functools.reduce(np.fmin, near))
+        here, before = np.take(wide, places, axis=axis), None
+        least = most = here
+        for k in range(1, 2 * REACH + 1):  # one node after the other: few arrays at a time
+            beyond = np.take(wide, places + k, axis=axis)
+            step = beyond - here
+            first = np.fmax(first, np.abs(step))
+            if before is not None:
+                second = np.fmax(second, np.abs(step - before))
+            least, most = np.fmin(least, beyond), np.fmax(most, beyond)
+            here, before = beyond, step
+        extent = np.fmax(extent, most - least)
     return _Differences(first, second, extent)
 
 

@@ -108,7 +108,7 @@ def _with_grid_error(
     if coarse.reason or first is None or coarse.on is None:
         solution.stats["grid_error"] = coarse.reason or UNSETTLED
         return solution
-    value, grid = np.asarray(solution.value, float), solution.grid
+    value, grid = np.asarray(solution.value), solution.grid
     horizon, highest = float(marched.task.horizon), _highest(marched.task, points)
     errors = np.zeros_like(value)
     for i, before in zip(coarse.kept, first, strict=True):
@@ -139,9 +139,9 @@ def _box_error(
     if first is None or second is None:
         return BoxError(None, box_error.UNSETTLED)
     found = box_error.of_two_marches(first, second, on.grid, np.asarray(solution.value), task.grid)
-    if found.error is None:
+    if found.error is None or len(coarse.kept) == len(solution.times):
         return found
-    errors = np.zeros((len(solution.times), *task.grid.shape))
+    errors = np.zeros((len(solution.times), *task.grid.shape), found.error.dtype)
     errors[coarse.kept] = found.error
     return found._replace(error=_at_all_times(errors, coarse.kept))
 

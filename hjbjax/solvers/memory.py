@@ -45,11 +45,12 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
         stored = 4 + (grid.ndim <= stencil.LONGER) + searched + choices + _imposing(choices)
         return math.ceil(word * stored) * grid.size
     conditions = (problem.target, problem.stopping_cost, problem.running_max, problem.disturbances)
-    # V, its defect, the actions, prescribed values or bounds at the nodes, the least cost if it gives the certificate,
-    # and two one-byte masks: the fixed nodes and the counted nodes
-    kept = word * (2 + actions + sum(each is not None for each in conditions) + (is_discounted(problem) is False)) + 2
+    undiscounted = is_discounted(problem) is False
+    # the initial V, V, its defect, the actions, prescribed values or bounds at the nodes, the least cost if it gives
+    # the certificate, and two one-byte masks: the fixed nodes and the counted nodes
+    kept = word * (3 + actions + sum(each is not None for each in conditions) + undiscounted) + 2
     kept += word * (choices + (2 + actions) * high_order)
-    look, correction = word * (4 + 2 * actions), 0
+    look, correction = word * (4 + 2 * actions + undiscounted + high_order), 0
     if method.evaluation is not None and not method.relaxes:
         # 2n jumps along the axes and four diagonal ones for each pair of axes
         weights = 2 * n * n if np.ndim(problem.noise) == 2 or callable(problem.noise) else 2 * n
@@ -63,7 +64,7 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
         look = word * (actions + 1 + (problem.noise is not None or is_constrained(problem)))
     else:
         look = word * (4 * max(actions, 1) + 1)  # one for the outflow Q + β
-        if problem.stopping_cost is not None and not problem.is_game and is_discounted(problem) is False:
+        if problem.stopping_cost is not None and not problem.is_game and undiscounted:
             # on ties the old policy is kept, which requires every rate
             look = max(look, math.ceil(word * (2.5 * n + actions)))
     look = max(look, math.ceil(word * _imposing(choices)))
@@ -71,7 +72,9 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
 
 
 def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool) -> int:
-    """Bytes that a march uses at its peak: ``kept`` slices, plus the memory of its steps or of the policy of one slice.
+    """Bytes that a march uses at its peak: during its steps, while it computes the policy of a slice, or at its end.
+
+    ``kept`` slices exist at the end, each with two estimates of its error, and an estimate that is being interpolated.
 
     Fitted to XLA's reports in one to six dimensions: V before and after a chunk, and for a high-order scheme the
     neighbours along each axis; limited slopes on unequal spacings, or next to a target between nodes, take six arrays
@@ -82,7 +85,7 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     one = word * (1 + actions)  # one slice; its memory is allocated when it is filled
     if not method.limited:
         inner = PolicyIteration(method.evaluation or Krylov())
-        return kept * one * grid.size + peak_bytes(problem, grid, inner, on.dtype)
+        return kept * (one + 2 * word) * grid.size + peak_bytes(problem, grid, inner, on.dtype)
     plain = scheme.even or (not any(grid.stretch) and not (scheme.subcell and problem.target is not None))
     if scheme.monotone:
         slopes = float(n <= stencil.LONGER)
@@ -98,7 +101,8 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     if policy:
         wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or plain else 6
         filling += word * (actions + wide) + 2
-    return math.ceil(((kept - 1) * one + stored + max(steps, filling)) * grid.size)
+    marching, ending = (kept - 1) * one + stored + max(steps, filling), kept * (one + 2 * word) + 1.5 * word
+    return math.ceil(max(marching, ending) * grid.size)
 
 
 def _sudden(problem: Problem, grid: Grid, dtype: DType, *, near: bool) -> int:

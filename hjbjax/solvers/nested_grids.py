@@ -14,6 +14,7 @@ FEWEST = 12  # least number of intervals per axis of a coarser grid
 FEWEST_TELLING = 6  # least number of intervals on a coarser grid that estimates the error of the finer one
 FARTHEST = 5  # largest ratio of the spacings of the two grids
 ROUNDING = 1e-9  # in units of the spacing
+BLOCK = 1 << 16  # nodes that are interpolated at a time, which fit into the cache
 
 
 def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
@@ -138,7 +139,8 @@ def places(fine: Grid, coarse: Grid, axis: int) -> np.ndarray:
 def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
     """Interpolate node values multilinearly from one grid of a box to another grid of that box, (*fine).
 
-    Uses NumPy, which is as fast here and does not need compiling.
+    Uses NumPy, which is as fast here and does not need compiling. At most one and a half arrays on the fine grid exist
+    at a time.
     """
     # axis by axis: 2n gathers instead of 2^n
     for axis, count in enumerate(fine.shape):
@@ -147,14 +149,26 @@ def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
         # in units of the coarse interval, also on a stretched axis, as both grids are images of one uniform axis
         place = np.arange(count) * (coarse.intervals(axis) / fine.intervals(axis))
         cell = np.minimum(place.astype(int), coarse.intervals(axis) - 1)
-        weight = np.asarray((place - cell).reshape([-1 if i == axis else 1 for i in range(fine.ndim)]), values.dtype)
-        below = np.take(values, cell, axis=axis)
-        below *= 1 - weight
-        above = np.take(values, (cell + 1) % coarse.shape[axis], axis=axis)
-        above *= weight
-        below += above  # in place: at most two arrays on the fine grid at a time
-        values = below
+        weight = np.asarray(place - cell, values.dtype)
+        values = _between(values, axis, (cell, (cell + 1) % coarse.shape[axis]), weight)
     return values
+
+
+def _between(values: np.ndarray, axis: int, nodes: tuple[np.ndarray, np.ndarray], weight: np.ndarray) -> np.ndarray:
+    """(1 − w) V[below] + w V[above] along an axis, for the indices ``nodes`` = (below, above), in blocks of rows."""
+    wide = np.empty((*values.shape[:axis], len(weight), *values.shape[axis + 1 :]), values.dtype)
+    weight = weight.reshape(-1, *[1] * (values.ndim - axis - 1))
+    rows = max(1, BLOCK * len(wide) // wide.size)
+    for first in range(0, len(wide), rows):
+        part = slice(first, first + rows)
+        if axis:
+            (below, above), share = (np.take(values[part], each, axis=axis) for each in nodes), weight
+        else:
+            (below, above), share = (values[each[part]] for each in nodes), weight[part]
+        below *= 1 - share
+        above *= share
+        np.add(below, above, out=wide[part])
+    return wide
 
 
 def restrict(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
@@ -175,7 +189,7 @@ def restrict(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
         for k in range(4):
             others = [j for j in range(4) if j != k]
             weight = np.prod([(place - first - j) / (k - j) for j in others], axis=0)  # Lagrange basis polynomial
-            along = weight.reshape([-1 if i == axis else 1 for i in range(fine.ndim)])
+            along = weight.reshape([-1 if i == axis else 1 for i in range(fine.ndim)]).astype(values.dtype)
             total = total + along * np.take(values, (first + k) % fine.shape[axis], axis=axis)
         values = total
     return values

@@ -145,9 +145,10 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer
         highest=_highest(settled),
     )
     error = grid_error.estimate_error(answers)
-    found = np.where(np.isfinite(value), error + _left(solution, settled, error), 0)
-    warn_of_grid(found[None], value[None])
-    return dataclasses.replace(solution, grid_error=found)
+    error += _left(solution, settled, error)
+    error[~np.isfinite(value)] = 0
+    warn_of_grid(error[None], value[None])
+    return dataclasses.replace(solution, grid_error=error)
 
 
 def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> None:
@@ -161,7 +162,8 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
     finite = np.isfinite(value)
     if not finite.any():
         return
-    scale = max(np.ptp(value[finite]), FLAT * np.max(np.abs(value[finite])))
+    least, most = np.min(value, where=finite, initial=np.inf), np.max(value, where=finite, initial=-np.inf)
+    scale = max(most - least, FLAT * max(abs(least), abs(most)))
     large, nodes = finite & (error > COARSE * scale), tuple(range(1, value.ndim))
     share = float(np.max(np.sum(large, axis=nodes) / np.maximum(np.sum(finite, axis=nodes), 1)))
     if share > NODES:
@@ -178,13 +180,13 @@ def _highest(settled: Settled) -> float:
     return grid_error.FIRST if settled.note else grid_error.SECOND
 
 
-def _left(solution: Solution, settled: Settled, error: np.ndarray) -> np.ndarray:
+def _left(solution: Solution, settled: Settled, error: np.ndarray) -> np.ndarray | float:
     """The algebraic error of the iteration, cost units, (*grid), for an estimate ``error`` of the grid's."""
     known = float(np.asarray(settled.state.progress.best)[0]) if solution.error is None else float(solution.error)
     left = min(known, float(settled.task.tol))
     if solution.error is None and settled.task.weights is not None:
         return remaining_error(settled.task, left, error)
-    return np.full(error.shape, left)
+    return left
 
 
 def solution_at_start(on: Discretisation, value: Nodes, code: Status) -> Solution:

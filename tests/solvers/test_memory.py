@@ -258,13 +258,13 @@ def test_hardly_any_memory():
 
 
 def test_six_dimensions_are_refused_with_a_way_out():
-    """35^6 nodes: what XLA would take is between 120 and 190 GB, by its own account of the loop on 9^6 nodes."""
+    """35^6 nodes: XLA would take 120 to 190 GB, by its account of the loop on 9^6 nodes, and the initial value 7 GB."""
     question = hjb.Problem(lambda x, u: jnp.concatenate([x[1:], u]), cost, hjb.Box([-1.0], [1.0]), discount=1.0)
     grid = hjb.Grid([-1.0] * 6, [1.0] * 6, (35,) * 6)
     with pytest.raises(MemoryError) as caught:
         hjb.solve(question, grid, max_memory=64 * 10**9, scheme=hjb.Upwind())
     message = str(caught.value)
-    assert 120 <= float(re.search(r"about (\d+) GB", message)[1]) <= 190
+    assert 120 <= float(re.search(r"about (\d+) GB", message)[1]) <= 197
     assert len(message.splitlines()) <= 6
     for word in ("1,838,265,625 nodes", "64 GB are free", "float32", "hjb.pontryagin", "N = ", "max_memory="):
         assert word in message

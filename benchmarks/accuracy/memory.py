@@ -25,7 +25,7 @@ CASES: tuple[tuple[str, str, int, float], ...] = (
     ("quadrotor tube", "march, Limited", 14, 0.02),
     ("quadrotor tube", "solve, value alone", 21, 3),
     ("quadrotor tube", "solve, value iteration", 17, 3),
-    ("quadrotor LQ", "solve, value alone", 21, 3),
+    ("quadrotor LQ", "solve from a guess, value alone", 21, 3),
     ("Dubins tube", "march, value alone", 361, 0.02),
     ("Dubins tube", "march, Limited", 201, 0.02),
     ("pendulum", "solve, default", 1600, 50),
@@ -120,6 +120,8 @@ def answer(question: str, run: str, count: int, length: float) -> Any:
     if run.startswith("march"):
         scheme = hjb.Limited() if run.endswith("Limited") else hjb.Upwind()
         return hjb.march(problem, grid, length, scheme=scheme, policy=not run.endswith("alone"), **options)
+    if "guess" in run:
+        options["guess"] = np.ones(grid.shape, np.float32)
     method = hjb.ValueIteration(policy=not run.endswith("alone"))
     return hjb.solve(problem, grid, method=method, max_steps=int(length), **options)
 

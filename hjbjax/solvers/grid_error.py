@@ -114,7 +114,7 @@ class _Differences(NamedTuple):
 
 def _along_axes(value: np.ndarray, fine: Grid, coarse: Grid) -> _Differences:
     """Differences of values on the finer grid over ``REACH`` nodes along every axis; NaN values are skipped."""
-    first = second = extent = np.zeros(coarse.shape)
+    first = second = extent = np.zeros(coarse.shape, value.dtype)
     for axis, count in enumerate(fine.shape):
         if count == 2 or axis not in fine.state_axes:  # a chain of two states
             continue

@@ -75,6 +75,7 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     """Bytes that a march uses at its peak: during its steps, while it computes the policy of a slice, or at its end.
 
     ``kept`` slices exist at the end, each with two estimates of its error, and an estimate that is being interpolated.
+    Before, the differences of one slice were computed for the first of them, on a grid with about 2^−n of the nodes.
 
     Fitted to XLA's reports in one to six dimensions: V before and after a chunk, and for a high-order scheme the
     neighbours along each axis; limited slopes on unequal spacings, or next to a target between nodes, take six arrays
@@ -101,8 +102,9 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     if policy:
         wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or plain else 6
         filling += word * (actions + wide) + 2
-    marching, ending = (kept - 1) * one + stored + max(steps, filling), kept * (one + 2 * word) + 1.5 * word
-    return math.ceil(max(marching, ending) * grid.size)
+    marching = (kept - 1) * one + stored + max(steps, filling)
+    estimating, ending = word * (kept + 0.75 + 11 / 2**n) + 3, word * (2 * kept + 1.5)
+    return math.ceil(max(marching, kept * one + max(estimating, ending)) * grid.size)
 
 
 def _sudden(problem: Problem, grid: Grid, dtype: DType, *, near: bool) -> int:

@@ -14,6 +14,7 @@ FEWEST = 12  # least number of intervals per axis of a coarser grid
 FEWEST_TELLING = 6  # least number of intervals on a coarser grid that estimates the error of the finer one
 FARTHEST = 5  # largest ratio of the spacings of the two grids
 ROUNDING = 1e-9  # in units of the spacing
+SINGLE = 1e-6  # the same for sums of weights in single precision
 BLOCK = 1 << 16  # nodes that are interpolated at a time, which fit into the cache
 
 
@@ -95,8 +96,9 @@ def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
     """True if every fixed node, or a fixed neighbour of it, lies in a coarse cell with a fixed corner."""
     if not np.any(held):
         return True
-    known = prolong(held.astype(float), fine, coarse) > 1 - ROUNDING
-    kept = held & (prolong(known.astype(float), coarse, fine) > ROUNDING)
+    # in single precision, which is exact for nodes that coincide
+    known = prolong(held.astype(np.float32), fine, coarse) > 1 - SINGLE
+    kept = held & (prolong(known.astype(np.float32), coarse, fine) > ROUNDING)
     for axis in fine.state_axes:  # a fixed node next to a kept one counts as kept, such as the tip of a disc
         along = np.moveaxis(kept, axis, 0)
         wide = along.copy()

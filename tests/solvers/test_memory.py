@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import tracemalloc
 from types import SimpleNamespace
 
 import jax
@@ -296,3 +297,19 @@ def test_the_estimate_is_near_what_the_compiler_reports(method):
     estimate = memory.peak_bytes(PROBLEM, grid, method, np.float64)
     assert peak / 4 <= estimate <= 4 * peak
     assert estimate >= peak / 2
+
+
+def test_numpy_takes_no_more_for_the_errors_of_a_march_than_is_told():
+    drift, controls, ends = hjb.zoo.Dubins().drift, hjb.Box([-1.0], [1.0]), ([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi])
+    tube = hjb.reach(drift, controls, lambda x: jnp.hypot(x[0], x[1]) - 0.5)
+    grid = hjb.Grid(*ends, (61, 61, 62), periodic=(False, False, True))
+    march = functools.partial(hjb.march, tube, grid, 0.02, policy=False, dtype="float32", progress=False, throw=False)
+    march()  # compiles
+    tracemalloc.start()
+    try:
+        solution = march()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak <= 1.1 * solution.stats["bytes"]
+    assert solution.grid_error.dtype == solution.box_error.dtype == np.float32

@@ -313,7 +313,9 @@ def limited(
     Next to an edge, and to the boundary of a target, the second difference is extrapolated as a constant. At a wall on
     which noise reflects, according to ``noisy``, the mirror image gives it (see ``noisy_walls``).
     """
-    bend = 2 * (up - down) / (link.up + link.down)  # V'' from two gaps of any lengths
+    # V'' from two gaps of any lengths, times the width of the box: the squares of V'' itself may leave float32's range
+    width = grid.hi[axis] - grid.lo[axis]
+    bend = 2 * (up - down) / ((link.up + link.down) / width)
     for step in (1, -1):
         if sloped(grid, axis, step) is not None:  # already the bend of the mirror image
             continue
@@ -329,7 +331,8 @@ def limited(
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
     # V(x ± h) = V ± h V' + h²/2 V'': half a gap times V'' is the leading error of a one-sided difference
-    up, down = up - link.up / 2 * van_albada(bend, above), down + link.down / 2 * van_albada(bend, below)
+    gaps = link.up / (2 * width), link.down / (2 * width)
+    up, down = up - gaps[0] * van_albada(bend, above), down + gaps[1] * van_albada(bend, below)
     return stopped(up, down, grid, axis)
 
 
@@ -337,7 +340,8 @@ def van_albada(a: Field, b: Field) -> Field:
     """The mean a b (a + b)/(a² + b²) of two second differences, zero if their signs differ (G. D. van Albada)."""
     agree = a * b > 0
     # the inner where keeps 0/0 out of the branch not taken, whose NaN would enter the derivative
-    return jnp.where(agree, a * b * (a + b) / jnp.where(agree, a * a + b * b, 1), 0)
+    # in this order no cube is formed, which leaves float32's range for units of 1e-13 or 1e13
+    return jnp.where(agree, a * b / jnp.where(agree, a * a + b * b, 1) * (a + b), 0)
 
 
 def neighbour_numbers(grid: Grid, offset: Sequence[int]) -> np.ndarray:

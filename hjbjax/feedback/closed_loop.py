@@ -281,7 +281,9 @@ def _through_changes(
     def changes(carry: tuple) -> jax.Array:
         return (carry[2] == CHANGE) & (carry[3] < stepping.max_steps)
 
-    none = jnp.asarray(CHANGE, jnp.int32), jnp.zeros((), jnp.int32), (t[None], y[None, :-1])
+    count = LOOKS if _looks(loop, t, end)[0] else 1
+    nothing = jnp.broadcast_to(t, (count,)), jnp.broadcast_to(y[:-1], (count, y.size - 1))
+    none = jnp.asarray(CHANGE, jnp.int32), jnp.zeros((), jnp.int32), nothing
     t, y, code, made, seen = jax.lax.while_loop(changes, on, (t, y, *none))
     return t, y, jnp.where(code == CHANGE, PathStatus.MAX_STEPS, code), made, seen
 

@@ -3,7 +3,8 @@
     cost = ∫ e^{−βt} L dt + e^{−βτ} · { exit cost on the target; ψ where V = ψ; V(T, ·) at the horizon T of a march }
 
 V(T, ·) is what ``march`` assumed: ``start``, else the terminal cost, else ψ, else g, and never more than ψ. Without
-running cost and noise nothing accumulates along a path, and its cost is the cost of the best moment to stop,
+running cost, interventions and noise nothing accumulates along a path, and its cost is the cost of the best moment to
+stop,
 
     cost = min over s of max{ e^{−βs} ψ(x(s)), max over r ≤ s of g(x(r)) },
 
@@ -22,7 +23,7 @@ from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.mode_axis import over_modes
-from hjbjax.problem.problem import Problem, is_discounted, is_random
+from hjbjax.problem.problem import Problem, has_interventions, is_discounted, is_random
 from hjbjax.problem.pytree import cast, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import with_any_control
@@ -87,11 +88,13 @@ def is_tube(problem: Problem) -> bool:
     """True if the cost of a path is an extreme along it: a running maximum, or only a cost of stopping.
 
     With noise the controller must decide to stop without knowing the rest of the path. The cost is then the cost at the
-    chosen time and not the least one along the path, so only a running maximum counts.
+    chosen time and not the least one along the path, so only a running maximum counts. Pushes and changes of the mode
+    are paid on the way, as a running cost is.
     """
     if problem.running_max is not None:
         return True
-    return problem.stopping_cost is not None and problem.cost is None and not is_random(problem)
+    free = problem.cost is None and not has_interventions(problem)
+    return problem.stopping_cost is not None and free and not is_random(problem)
 
 
 def surplus(problem: Problem, feedback: object) -> Lookup | None:

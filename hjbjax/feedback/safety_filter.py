@@ -17,7 +17,7 @@ import numpy as np
 
 from hjbjax.feedback.feedback import GridFeedback, Place, is_grid_feedback
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, has_interventions
 from hjbjax.problem.pytree import as_partial, front_door, is_traced, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number
@@ -144,7 +144,7 @@ def least_restrictive(solution: Solution, nominal: GridFeedback | Callable, *, m
 def _is_tube(problem: Problem) -> bool:
     """True if V is an extreme of a signed distance along the path, whose sign decides safety."""
     random = problem.noise is not None or bool(problem.jumps)
-    priced = random or problem.cost is not None or problem.target is not None
+    priced = random or problem.cost is not None or problem.target is not None or has_interventions(problem)
     extreme = problem.running_max is not None or problem.stopping_cost is not None
     undiscounted = is_traced(problem.discount) or not np.any(np.asarray(problem.discount))
     return extreme and undiscounted and not priced

@@ -78,8 +78,8 @@ def simulate(
       feedback: a Solution, a ``greedy_feedback``, a solution without a grid, as of ``hopf`` and ``neural``, or a
         function that returns the control, shape (m,). ``None`` if there is no control.
         With a Solution of a problem with a stopping cost, the path ends and pays ψ where stopping is optimal, that is
-        where V = ψ at all surrounding nodes. Without a running cost and without noise it continues, and its cost is the
-        cost of the best moment to stop.
+        where V = ψ at all surrounding nodes. Without a running cost, pushes, changes of the mode by choice, and noise
+        it continues, and its cost is the cost of the best moment to stop.
         A marched Solution must be stored at enough times: at least ten over the duration. A path as long as the horizon
         pays at its end what ``march`` assumed there: ``start``, the terminal cost, else ψ, else g.
         If the feedback is a function, the terminal cost is paid at the end.

@@ -290,6 +290,13 @@ def is_constrained(problem: Problem) -> bool:
     return problem.stopping_cost is not None or problem.running_max is not None
 
 
+def has_interventions(problem: Problem) -> bool:
+    """True if the controller may change the mode or push the state, and pays for each change or push."""
+    changes = problem.switching_costs is not None
+    changes |= problem.modes is not None and problem.modes.switching_cost is not None
+    return changes or bool(problem.pushes) or bool(problem.push_steps)
+
+
 def _payoff(costs: dict[str, Any], rewards: dict[str, Any], moves: Sequence[Jump | Push]) -> str:
     """The word for the payments of a problem, "cost" or "reward"; refuses both together, except in jumps and pushes."""
     paid, earned = ([name for name, given in each.items() if given is not None] for each in (costs, rewards))

@@ -139,6 +139,51 @@ def test_one_had_better_stop_at_once():
     assert path.cost == path.promised == pytest.approx(0.2, rel=1e-12)
 
 
+def pushed_tube(discount):
+    """The least x² that is reached, where the drift leads away; the push back costs 0.6 per unit of length."""
+    return hjb.Problem(
+        lambda x, u: 0.2 + u, None, hjb.Box([-0.1], [0.1]), discount=discount, stopping_cost=lambda x: x @ x,
+        pushes=[hjb.Push([-1.0], cost=0.6)],
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the box decides V")
+def test_pushes_are_paid_without_a_running_cost():
+    """The path cost the least x² on the way, 0.09, as in a tube: nobody paid for the push from 1.2 to 0.3."""
+    problem = pushed_tube(0.0)
+    for solution in (hjb.solve(problem, LINE), hjb.march(problem, LINE, 1.0, times=TIMES)):
+        path = hjb.simulate(problem, solution, [1.2], 1.0)
+        assert path.cost == pytest.approx(0.6 * 0.9 + 0.09, rel=1e-9)
+        assert path.promised == pytest.approx(path.cost, rel=1e-9)
+    # with a discount it is best to drift to 1.3 and to push at the horizon
+    solution = hjb.march(pushed_tube(0.5), LINE, 1.0, times=TIMES)
+    path = hjb.simulate(pushed_tube(0.5), solution, [1.2], 1.0)
+    assert path.promised == pytest.approx(np.exp(-0.5) * 0.69, rel=1e-3)
+    assert path.cost == pytest.approx(np.exp(-0.5) * 0.69, rel=0.01)
+
+
+def moded_tube(price):
+    """The least x² that is reached, where one mode leads right and the other left."""
+    changes = None if price is None else [[0.0, price], [price, 0.0]]
+    return hjb.Problem(
+        lambda x, u, mode: (0.5, -0.5)[mode] + u, None, hjb.Box([-0.1], [0.1]), stopping_cost=lambda x, mode: x @ x,
+        modes=hjb.Modes(("right", "left"), switching_cost=changes),
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the box decides V")
+@pytest.mark.parametrize(("price", "mode", "least"), [(0.2, "right", 0.2), (0.2, "left", 0.0), (None, "left", 0.0)])
+def test_changes_of_the_mode_are_paid_without_a_running_cost(price, mode, least):
+    """Paths failed with a TypeError of JAX, also those of modes that never change."""
+    problem = moded_tube(price)
+    solution = hjb.march(problem, LINE, 3.0, times=3 * TIMES)
+    path = hjb.simulate(problem, solution, [1.2], 3.0, mode=mode)
+    assert path.cost == pytest.approx(least, abs=1e-3)
+    assert path.promised == pytest.approx(least, abs=1e-3)
+
+
 @pytest.mark.slow
 def test_feedback_continues_v_beyond_an_open_end_as_the_scheme_does():
     """V was clamped there: with noise its second difference was that of a wall, and u was 0.05 and 3 at the ends."""

@@ -74,3 +74,18 @@ def test_a_program_of_32_bits_returns_the_grid_that_it_solves_on():
     wanted = hjb.solve(problem, grid).value
     solution = jax.jit(lambda problem: hjb.solve(problem, grid))(problem)
     np.testing.assert_allclose(solution.value, wanted, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1.0, 1e8])
+def test_second_order_slopes_in_float32_know_no_unit(unit):
+    """Products of three second differences left the range of float32: first order for 1e8, NaN for 1e-6."""
+    problem = hjb.Problem(
+        lambda x, u: unit * u, lambda x, u: (x @ x) / unit**2, hjb.Box([-1.0], [1.0]),
+        target=lambda x: jnp.abs(x[0]) - 0.23 * unit,
+    )  # fmt: skip
+    grid = hjb.Grid([-1.5 * unit], [1.5 * unit], (61,))
+    found = hjb.march(problem, grid, 1.5, scheme=hjb.Limited(split=True), dtype="float32").value[0]
+    x = np.abs(np.linspace(-1.5, 1.5, 61))
+    # the fastest way inwards: the integral of y² from 0.23 to |x|
+    np.testing.assert_allclose(found, np.where(x > 0.23, (x**3 - 0.23**3) / 3, 0), atol=0.003)

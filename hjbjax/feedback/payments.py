@@ -3,8 +3,7 @@
     cost = ∫ e^{−βt} L dt + e^{−βτ} · { exit cost on the target; ψ where V = ψ; V(T, ·) at the horizon T of a march }
 
 V(T, ·) is what ``march`` assumed: ``start``, else the terminal cost, else ψ, else g, and never more than ψ. Without
-running cost, interventions and noise nothing accumulates along a path, and its cost is the cost of the best moment to
-stop,
+running cost, interventions and noise nothing accumulates along a path. Its cost is that of the best moment to stop,
 
     cost = min over s of max{ e^{−βs} ψ(x(s)), max over r ≤ s of g(x(r)) },
 

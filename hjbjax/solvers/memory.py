@@ -59,6 +59,8 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
         weights += _sudden(problem, grid, dtype, near=method.evaluation.rough)
         correction = method.evaluation.bytes_per_node(weights, word) + word * 3 * (choices > 0)
         look = max(look, word * (10 + 2 * choices) * (choices > 0))  # also the nodes of every intervention
+        if problem.is_game and not method.evaluation.rough:  # the replies of the inner player, with a linear solve each
+            look += correction // 2
     elif is_discounted(problem) and not searched:
         # the actions, computed at the end, and the outflow Q + β; a step computes only the defect
         look = word * (actions + 1 + (problem.noise is not None or is_constrained(problem)))
@@ -97,7 +99,11 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     given = sum(each is not None for each in (problem.exit_cost, problem.stopping_cost, problem.running_max))
     stored = word * given + 1 if policy else 0
     choices = _choices(problem, grid)
-    steps = word * (3 + slopes + _searched(problem, n, on.dtype) + choices + _imposing(choices))
+    searched = float(_searched(problem, n, on.dtype))
+    if problem.is_game and not on.players.decoupled:
+        # with a policy the other order of the players is computed too, for the gap between both
+        searched = (searched + 4 + 2 * _actions(problem)) * (1 + policy)
+    steps = word * (3 + slopes + searched + choices + _imposing(choices))
     filling = one + word  # the last term is V itself
     if policy:
         wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or plain else 6
@@ -137,13 +143,14 @@ def _actions(problem: Problem) -> int:
 def _searched(problem: Problem, n: int, dtype: DType) -> int:
     """Words per node of an optimum without a formula: a search between samples, or quadratic programs.
 
-    A search stores the best action so far, the current one, and both players' actions. A program has m + m² numbers and
-    m + 3 for every kink; it is solved on parts of the grid.
+    A search stores the best action so far and the current one, and for every candidate of the outer player the inner
+    player's. A program has m + m² numbers and m + 3 for every kink; it is solved on parts of the grid.
     """
     players = find_players(problem, n, dtype)
     alone = [each for each in players.both if not (each.exact or each.enumerated)]
     if problem.is_game and not players.decoupled:
-        return 10 + 2 * _actions(problem)
+        curved = all(any(player.curved) for player in players.both)  # also optima between the bounds
+        return 2 + 10 * max(len(alone), curved)
     words = [5 + 2 * each.admissible.dim for each in alone if each.admissible is not None]
     for player in players.both:
         for group in itertools.compress(player.groups, player.programs if player.programmed else ()):

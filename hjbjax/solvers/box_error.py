@@ -40,7 +40,7 @@ from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import warn
 from hjbjax.solvers import nested_grids
 from hjbjax.solvers.coarse_levels import on_coarser
-from hjbjax.solvers.result import warn_of_cuts
+from hjbjax.solvers.result import extremes, warn_of_cuts
 from hjbjax.solvers.settle import Settled
 
 SHARE, FEWEST, MOST = 16, 600, 3000  # nodes of the coarse grid: one in 16, within these limits
@@ -140,7 +140,7 @@ def of_two_marches(first: np.ndarray, second: np.ndarray, coarse: Grid, value: N
         return BoxError(None, NEVER_REACHED)
     error = np.empty((len(change), *fine.shape), change.dtype)
     for each, wide in zip(change, error, strict=True):  # one after the other: no second array with all times
-        wide[:] = nested_grids.prolong(each, coarse, fine)
+        nested_grids.prolong_into(wide, each, coarse, fine)
     return BoxError(error, sides=_sides(coarse, np.max(change, axis=0) > LARGE * scale))
 
 
@@ -273,8 +273,9 @@ def _sides(grid: Grid, nodes: np.ndarray) -> tuple[tuple[int, int], ...]:
 def warn_of_box(found: BoxError, value: np.ndarray, grid: Grid) -> None:
     """Warn of ends whose assumption moves V by more than a tenth of its range at many nodes."""
     finite = np.isfinite(value)
-    large = np.asarray(found.error) > LARGE * np.ptp(value[finite])
-    share = float(np.mean(large[finite]))
+    least, most = extremes(value, finite)
+    large = np.asarray(found.error) > LARGE * (most - least)
+    share = float(np.mean(large, where=finite))
     if share <= NODES or not found.sides:
         return
     words = {-1: "lower", 1: "upper"}

@@ -76,7 +76,7 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
 def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool) -> int:
     """Bytes that a march uses at its peak: during its steps, while it computes the policy of a slice, or at its end.
 
-    ``kept`` slices exist at the end, each with two estimates of its error, and an estimate that is being interpolated.
+    ``kept`` slices exist at the end, each with two estimates of its error, and half of one that is being interpolated.
     Before, the differences of one slice were computed for the first of them, on a grid with about 2^−n of the nodes.
 
     Fitted to XLA's reports in one to six dimensions: V before and after a chunk, and for a high-order scheme the
@@ -109,7 +109,7 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
         wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or plain else 6
         filling += word * (actions + wide) + 2
     marching = (kept - 1) * one + stored + max(steps, filling)
-    estimating, ending = word * (kept + 0.75 + 11 / 2**n) + 3, word * (2 * kept + 1.5)
+    estimating, ending = word * (kept + 0.75 + 11 / 2**n) + 3, word * (2 * kept + 0.5) + 2
     return math.ceil(max(marching, kept * one + max(estimating, ending)) * grid.size)
 
 

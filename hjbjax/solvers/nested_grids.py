@@ -144,21 +144,34 @@ def prolong(values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
     Uses NumPy, which is as fast here and does not need compiling. At most one and a half arrays on the fine grid exist
     at a time.
     """
-    # axis by axis: 2n gathers instead of 2^n
-    for axis, count in enumerate(fine.shape):
-        if coarse.shape[axis] == count:
-            continue
+    axes = [axis for axis, count in enumerate(fine.shape) if coarse.shape[axis] != count]
+    if not axes:
+        return values
+    return prolong_into(np.empty(fine.shape, values.dtype), values, coarse, fine)
+
+
+def prolong_into(result: np.ndarray, values: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
+    """``prolong`` into the array ``result``, (*fine), which is returned."""
+    axes = [axis for axis, count in enumerate(fine.shape) if coarse.shape[axis] != count]
+    if not axes:
+        result[...] = values
+    for axis in axes:  # axis by axis: 2n gathers instead of 2^n
+        count = fine.shape[axis]
         # in units of the coarse interval, also on a stretched axis, as both grids are images of one uniform axis
         place = np.arange(count) * (coarse.intervals(axis) / fine.intervals(axis))
         cell = np.minimum(place.astype(int), coarse.intervals(axis) - 1)
         weight = np.asarray(place - cell, values.dtype)
-        values = _between(values, axis, (cell, (cell + 1) % coarse.shape[axis]), weight)
-    return values
+        shape = (*values.shape[:axis], count, *values.shape[axis + 1 :])
+        wide = result if axis == axes[-1] else np.empty(shape, values.dtype)
+        _between(wide, values, axis, (cell, (cell + 1) % coarse.shape[axis]), weight)
+        values = wide
+    return result
 
 
-def _between(values: np.ndarray, axis: int, nodes: tuple[np.ndarray, np.ndarray], weight: np.ndarray) -> np.ndarray:
-    """(1 − w) V[below] + w V[above] along an axis, for the indices ``nodes`` = (below, above), in blocks of rows."""
-    wide = np.empty((*values.shape[:axis], len(weight), *values.shape[axis + 1 :]), values.dtype)
+def _between(
+    wide: np.ndarray, values: np.ndarray, axis: int, nodes: tuple[np.ndarray, np.ndarray], weight: np.ndarray
+) -> None:
+    """Set ``wide`` to (1 − w) V[below] + w V[above] along an axis, ``nodes`` = (below, above), in blocks of rows."""
     weight = weight.reshape(-1, *[1] * (values.ndim - axis - 1))
     rows = max(1, BLOCK * len(wide) // wide.size)
     for first in range(0, len(wide), rows):
@@ -170,7 +183,6 @@ def _between(values: np.ndarray, axis: int, nodes: tuple[np.ndarray, np.ndarray]
         below *= 1 - share
         above *= share
         np.add(below, above, out=wide[part])
-    return wide
 
 
 def restrict(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:

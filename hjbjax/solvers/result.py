@@ -162,7 +162,7 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
     finite = np.isfinite(value)
     if not finite.any():
         return
-    least, most = np.min(value, where=finite, initial=np.inf), np.max(value, where=finite, initial=-np.inf)
+    least, most = extremes(value, finite)
     scale = max(most - least, FLAT * max(abs(least), abs(most)))
     large, nodes = finite & (error > COARSE * scale), tuple(range(1, value.ndim))
     share = float(np.max(np.sum(large, axis=nodes) / np.maximum(np.sum(finite, axis=nodes), 1)))
@@ -171,6 +171,11 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
             f"the grid is coarse for this problem: its error is above a tenth of the range of V at {share:.0%} of the "
             f"nodes (Solution.grid_error). Use more {more}, or concentrate nodes where V bends: Grid(..., stretch=)"
         )
+
+
+def extremes(value: np.ndarray, where: np.ndarray) -> tuple[float, float]:
+    """The least and the largest value at some nodes, without a copy of these."""
+    return float(np.min(value, where=where, initial=np.inf)), float(np.max(value, where=where, initial=-np.inf))
 
 
 def _highest(settled: Settled) -> float:

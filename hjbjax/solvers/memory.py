@@ -74,21 +74,29 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
 
 
 def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool) -> int:
-    """Bytes that a march uses at its peak: during its steps, while it computes the policy of a slice, or at its end.
+    """Bytes that a march with ``kept`` slices uses at its peak, during its steps or while its errors are estimated.
 
-    ``kept`` slices exist at the end, each with two estimates of its error, and half of one that is being interpolated.
-    Before, the differences of one slice were computed for the first of them, on a grid with about 2^−n of the nodes.
+    At the end every slice has two estimates of its error, and half of one is being interpolated. Before, the
+    differences of one slice are computed for the first of them, on a grid with about 2^−n of the nodes.
+    """
+    word, n = on.dtype.itemsize, on.grid.ndim
+    slices = kept * _slice(on, policy=policy)
+    estimating, ending = word * (kept + 0.75 + 11 / 2**n) + 3, word * (2 * kept + 0.5) + 2
+    return max(of_steps(on, kept, method, policy=policy), math.ceil((slices + max(estimating, ending)) * on.grid.size))
+
+
+def of_steps(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool) -> int:
+    """Bytes that the steps of a march use: ``kept`` slices, plus the steps themselves or the policy of one slice.
 
     Fitted to XLA's reports in one to six dimensions: V before and after a chunk, and for a high-order scheme the
     neighbours along each axis; limited slopes on unequal spacings, or next to a target between nodes, take six arrays
     per axis.
     """
     problem, grid, scheme, word, n = on.problem, on.grid, on.scheme, on.dtype.itemsize, on.grid.ndim
-    actions = _actions(problem) if policy else 0
-    one = word * (1 + actions)  # one slice; its memory is allocated when it is filled
+    one = _slice(on, policy=policy)  # its memory is allocated when it is filled
     if not method.limited:
         inner = PolicyIteration(method.evaluation or Krylov())
-        return kept * (one + 2 * word) * grid.size + peak_bytes(problem, grid, inner, on.dtype)
+        return kept * one * grid.size + peak_bytes(problem, grid, inner, on.dtype)
     plain = scheme.even or (not any(grid.stretch) and not (scheme.subcell and problem.target is not None))
     if scheme.monotone:
         slopes = float(n <= stencil.LONGER)
@@ -107,10 +115,13 @@ def of_march(on: Discretisation, kept: int, method: TimeMethod, *, policy: bool)
     filling = one + word  # the last term is V itself
     if policy:
         wide = 1 if scheme.monotone and n > stencil.LONGER else 2 if scheme.monotone or plain else 6
-        filling += word * (actions + wide) + 2
-    marching = (kept - 1) * one + stored + max(steps, filling)
-    estimating, ending = word * (kept + 0.75 + 11 / 2**n) + 3, word * (2 * kept + 0.5) + 2
-    return math.ceil(max(marching, kept * one + max(estimating, ending)) * grid.size)
+        filling += word * (_actions(problem) + wide) + 2
+    return math.ceil(((kept - 1) * one + stored + max(steps, filling)) * grid.size)
+
+
+def _slice(on: Discretisation, *, policy: bool) -> int:
+    """Bytes per node of V at one kept time, with its actions if the policy is stored."""
+    return on.dtype.itemsize * (1 + policy * _actions(on.problem))
 
 
 def _sudden(problem: Problem, grid: Grid, dtype: DType, *, near: bool) -> int:

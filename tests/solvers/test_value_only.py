@@ -185,7 +185,7 @@ def test_a_solve_takes_twelve_bytes_a_node_beyond_the_value(n, count, problem):
     [hjb.Upwind(), pytest.param(hjb.Limited(), marks=pytest.mark.slow), hjb.Weno5()],
     ids=lambda s: type(s).__name__,
 )
-def test_a_march_takes_what_is_told_beforehand(n, count, policy, scheme):
+def test_the_steps_of_a_march_take_what_is_told_beforehand(n, count, policy, scheme):
     problem, grid, kind = hjb.reach(ahead, U, disc), box(n, count), np.dtype(np.float32)
     with jax.enable_x64(False):
         on = Discretisation(*cast((problem, grid), kind), scheme, kind)
@@ -193,7 +193,7 @@ def test_a_march_takes_what_is_told_beforehand(n, count, policy, scheme):
         front = jax.eval_shape(time_stepping.begin, task, jax.ShapeDtypeStruct(grid.shape, kind), 1.0)
         taken = peak(march_run._run.lower(task, front, jnp.zeros((), kind), 1)) / grid.size
         filling = peak(march_run._greedy.lower(task, front.value, jnp.zeros((), kind))) / grid.size
-    told = [memory.of_march(on, k, hjb.Explicit(), policy=policy) / grid.size for k in (1, 3)]
+    told = [memory.of_steps(on, k, hjb.Explicit(), policy=policy) / grid.size for k in (1, 3)]
     assert told[1] - told[0] == pytest.approx(2 * 4 * (1 + policy), abs=0.01)  # of whole bytes
     # a slice is filled when its time has come; with its policy, of one control, and then nothing is stepped
     assert told[0] == pytest.approx(max(taken, filling + 8 if policy else 8), rel=0.2)

@@ -272,7 +272,7 @@ def test_signals_that_come_together_are_one_request(launch):
 
 
 def test_a_deaf_child_is_killed_after_the_grace_and_named(launch):
-    found = launch(GENTLE, DEAF, GENTLE, grace=1)
+    found = launch(GENTLE, DEAF, GENTLE, grace=3)
     found.pids()
     found.process.send_signal(signal.SIGTERM)
     outcome = found.ended()
@@ -292,7 +292,7 @@ def test_a_child_that_stays_stopped_is_continued_to_its_end(launch):
 def test_a_child_that_has_not_arrived_in_time_is_the_culprit(launch):
     """As one that hangs while it starts: JAX would abort the one that waits for it, after five minutes."""
     arrives = "print('arrived', flush=True); "
-    found = launch(arrives + GENTLE, DEAF, arrives + "sys.exit(0)", grace=0.5, arrival=["arrived", 1])
+    found = launch(arrives + GENTLE, DEAF, arrives + "sys.exit(0)", grace=2, arrival=["arrived", 1])
     outcome = found.ended()
     assert (outcome["culprit"], outcome["late"], outcome["killed"]) == (1, [1], [1])
     assert codes_of(outcome) == [130, -9, 0]
@@ -300,7 +300,7 @@ def test_a_child_that_has_not_arrived_in_time_is_the_culprit(launch):
 
 
 def test_a_deaf_child_is_killed_where_another_one_died(launch):
-    found = launch(DEAF, GENTLE, DEAF, grace=1)
+    found = launch(DEAF, GENTLE, DEAF, grace=3)
     os.kill(found.pids()[1], signal.SIGKILL)
     outcome = found.ended()
     assert (outcome["culprit"], outcome["killed"]) == (1, [0, 2])

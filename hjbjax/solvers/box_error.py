@@ -40,7 +40,7 @@ from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import warn
 from hjbjax.solvers import nested_grids
 from hjbjax.solvers.coarse_levels import on_coarser
-from hjbjax.solvers.result import extremes, warn_of_cuts
+from hjbjax.solvers.result import least_and_most, warn_of_cuts
 from hjbjax.solvers.settle import Settled
 
 SHARE, FEWEST, MOST = 16, 600, 3000  # nodes of the coarse grid: one in 16, within these limits
@@ -273,7 +273,7 @@ def _sides(grid: Grid, nodes: np.ndarray) -> tuple[tuple[int, int], ...]:
 def warn_of_box(found: BoxError, value: np.ndarray, grid: Grid) -> None:
     """Warn of ends whose assumption moves V by more than a tenth of its range at many nodes."""
     finite = np.isfinite(value)
-    least, most = extremes(value, finite)
+    least, most = least_and_most(value, finite)
     large = np.asarray(found.error) > LARGE * (most - least)
     share = float(np.mean(large, where=finite))
     if share <= NODES or not found.sides:

@@ -162,7 +162,7 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
     finite = np.isfinite(value)
     if not finite.any():
         return
-    least, most = extremes(value, finite)
+    least, most = least_and_most(value, finite)
     scale = max(most - least, FLAT * max(abs(least), abs(most)))
     large, nodes = finite & (error > COARSE * scale), tuple(range(1, value.ndim))
     share = float(np.max(np.sum(large, axis=nodes) / np.maximum(np.sum(finite, axis=nodes), 1)))
@@ -173,7 +173,7 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
         )
 
 
-def extremes(value: np.ndarray, where: np.ndarray) -> tuple[float, float]:
+def least_and_most(value: np.ndarray, where: np.ndarray) -> tuple[float, float]:
     """The least and the largest value at some nodes, without a copy of these."""
     return float(np.min(value, where=where, initial=np.inf)), float(np.max(value, where=where, initial=-np.inf))
 

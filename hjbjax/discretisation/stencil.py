@@ -331,8 +331,8 @@ def limited(
     if link.meets_down is not None:
         below = jnp.where(link.meets_down[0], bend, below)
     # V(x ± h) = V ± h V' + h²/2 V'': half a gap times V'' is the leading error of a one-sided difference
-    gaps = link.up / (2 * width), link.down / (2 * width)
-    up, down = up - gaps[0] * van_albada(bend, above), down + gaps[1] * van_albada(bend, below)
+    up -= link.up / (2 * width) * van_albada(bend, above)
+    down += link.down / (2 * width) * van_albada(bend, below)
     return stopped(up, down, grid, axis)
 
 

@@ -115,7 +115,10 @@ def stop_at(task: Task, error: np.ndarray, value: np.ndarray) -> Task:
 
 
 def remaining_error(task: Task, left: float, error: np.ndarray) -> np.ndarray | float:
-    """The error of the iteration, (*grid), for its norm ``left``; it is spread like the estimate of the grid error."""
+    """The error of the iteration for its norm ``left``, spread like the estimate of the grid error, (*grid).
+
+    One number for all nodes if the norm has no mean, or the estimate is zero.
+    """
     largest, mean = np.asarray(task.weights, float).tolist()
     if mean == 0 or np.max(error) == 0:
         return left / largest

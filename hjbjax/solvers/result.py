@@ -174,7 +174,7 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
 
 
 def least_and_most(value: np.ndarray, where: np.ndarray) -> tuple[float, float]:
-    """The least and the largest value at some nodes, without a copy of these."""
+    """The least and the largest of the values at some nodes, without a copy of these values."""
     return float(np.min(value, where=where, initial=np.inf)), float(np.max(value, where=where, initial=-np.inf))
 
 
@@ -186,7 +186,7 @@ def _highest(settled: Settled) -> float:
 
 
 def _left(solution: Solution, settled: Settled, error: np.ndarray) -> np.ndarray | float:
-    """The algebraic error of the iteration, cost units, (*grid), for an estimate ``error`` of the grid's."""
+    """The algebraic error of the iteration, cost units, (*grid) or one number; ``error`` estimates the grid's."""
     known = float(np.asarray(settled.state.progress.best)[0]) if solution.error is None else float(solution.error)
     left = min(known, float(settled.task.tol))
     if solution.error is None and settled.task.weights is not None:

@@ -128,6 +128,12 @@ class Task(GridTask):
         return at_ends and players.exact and self.scheme.monotone
 
     @property
+    def keeps_actions(self) -> bool:
+        """True if a policy keeps its actions where others are as good, which keeps a proper policy proper."""
+        problem = self.problem
+        return problem.stopping_cost is not None and not problem.is_game and self.certificate in TO_THE_END
+
+    @property
     def constrained(self) -> bool:
         """True if the problem has a stopping cost or a running maximum."""
         return is_constrained(self.problem)
@@ -393,7 +399,7 @@ def _evaluate(
     policy = bellman.greedy(
         task.on, value, task.obstacles.fixed, incumbent=incumbent, lost=task.lost, first_order=task.first_order
     )
-    if problem.stopping_cost is not None and not problem.is_game and task.certificate in TO_THE_END:
+    if task.keeps_actions:
         fixed = task.obstacles.fixed | first  # there are no actions to keep
         policy = bellman.improvement(task.on, value, fixed, policy, incumbent)
     left = task.equation(value, policy)

@@ -335,6 +335,8 @@ def _solve_chains(
         for i, each in enumerate(settled)
         if not asked[i].scheme.monotone and each.code not in CUT and (each.code is Status.CONVERGED or not sharpen)
     ]
+    for i in further:
+        settled[i] = settled[i].without_actions()
     sharp = [raise_order(settled[i], asked[i].scheme, clock, to_grid_error=choices.to_grid_error) for i in further]
     guesses, further_names = [settled[i].state.value for i in further], [names[i] for i in further]
     better = _iterate([each.task for each in sharp], guesses, further_names, clock, over)

@@ -132,10 +132,12 @@ def settled_on_host(
     start, shapes, coarser = coarse_levels.first_guess(task, on.scheme, method, start, clock, asked_again=asked_again)
     task = staged(task, on.scheme)
     settled = settle(task, assumptions, reached, start, clock)
+    del start  # an array of all nodes
     if settled.task is task:  # the nodes with prescribed values are those of the coarser grid
         settled = settled._replace(coarser=coarser)
     about: dict[str, Any] = {"levels": [*shapes, grid.shape]}
     if not on.scheme.monotone and (settled.code is Status.CONVERGED or not sharpen):
+        settled = settled.without_actions()
         sharp = second_order(settled, on.scheme, clock, to_grid_error=choices.to_grid_error)
         settled = better_of(settled, sharp, clock, sharpen=sharpen)
     if type(settled.task.method.evaluation) is not type(method.evaluation):

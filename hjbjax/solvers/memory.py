@@ -35,8 +35,8 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
 
     The state is the value, the remaining rate and the policy; each evaluation creates the next state while the old one
     lives. Sweeps store the weights (one per axis without noise, two with noise) and the source twice, plain and skewed,
-    in single precision. A Krylov method stores its vectors. With a scheme of high order the state of the monotone
-    iteration lives until the end.
+    in single precision. A Krylov method stores its vectors. With a scheme of high order the value of the monotone
+    iteration lives until the end, in place of the initial V, and its policy if this does not follow from the value.
     """
     word, n, actions = np.dtype(dtype).itemsize, len(grid.state_axes), _actions(problem)
     searched, choices = _searched(problem, grid.ndim, dtype), _choices(problem, grid)
@@ -49,7 +49,9 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
     # the initial V, V, its defect, the actions, prescribed values or bounds at the nodes, the least cost if it gives
     # the certificate, and two one-byte masks: the fixed nodes and the counted nodes
     kept = word * (3 + actions + sum(each is not None for each in conditions) + undiscounted) + 2
-    kept += word * (choices + (2 + actions) * high_order)
+    stopping = problem.stopping_cost is not None and not problem.is_game and undiscounted
+    both = stopping or not find_players(problem, grid.ndim, dtype).exact  # the policies of both iterations
+    kept += word * (choices + (1 + actions) * (high_order and both))
     look, correction = word * (4 + 2 * actions + undiscounted + high_order), 0
     if method.evaluation is not None and not method.relaxes:
         # 2n jumps along the axes and four diagonal ones for each pair of axes
@@ -66,7 +68,7 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
         look = word * (actions + 1 + (problem.noise is not None or is_constrained(problem)))
     else:
         look = word * (4 * max(actions, 1) + 1)  # one for the outflow Q + β
-        if problem.stopping_cost is not None and not problem.is_game and undiscounted:
+        if stopping:
             # on ties the old policy is kept, which requires every rate
             look = max(look, math.ceil(word * (2.5 * n + actions)))
     look = max(look, math.ceil(word * _imposing(choices)))

@@ -233,7 +233,7 @@ def _assemble(task: Task, state: State, assumptions: Assumptions) -> Solution:
     return Solution(
         value=state.value,
         policy=None if task.bare else policy,
-        disturbance=xp.stack(disturbances, axis=-1) if problem.is_game and not task.bare else None,
+        disturbance=xp.stack(disturbances, axis=-1) if disturbances else None,
         code=state.progress.code,
         steps=state.progress.steps,
         enclosure=_enclosure(task, state, assumptions),

@@ -19,7 +19,7 @@ def second_order(settled: Settled, scheme: Scheme, clock: Clock, *, to_grid_erro
     """The solution by a high-order scheme, started from the monotone one, which it keeps as its ``origin``.
 
     If the clock stops it before its initial evaluation, the monotone solution is returned with the status of the stop.
-    ``to_grid_error`` as in ``raise_order``.
+    ``settled`` may lack its actions. ``to_grid_error`` as in ``raise_order``.
     """
     over = clock.over()
     if over is not None:
@@ -54,8 +54,11 @@ def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) 
     The monotone solution is returned if the second-order iteration did not converge, or if it moved V further than the
     error of the grid explains.
     """
-    if not sharpen:
-        return sharp
+    return (_better_of(settled, sharp, clock) if sharpen else sharp).with_actions()
+
+
+def _better_of(settled: Settled, sharp: Settled, clock: Clock) -> Settled:
+    """As ``better_of`` if the caller left the choice; the monotone solution may lack its actions."""
     settled = sharp.origin or settled  # with its answer on the coarser grid
     if sharp.code is not Status.CONVERGED:
         # Ctrl-C leaves the solve unfinished; after a time limit the monotone answer is complete

@@ -4,8 +4,10 @@ import dataclasses
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.iteration.bellman import Greedy
 from hjbjax.iteration.certificates import Certificate
 from hjbjax.iteration.evaluation import Krylov
 from hjbjax.iteration.fixed_point import State, Task
@@ -16,7 +18,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers.coarse_levels import CoarserAnswer
 from hjbjax.solvers.order import at_order
 from hjbjax.solvers.setup import Assumptions, forced_only
-from hjbjax.solvers.stationary_run import iterate
+from hjbjax.solvers.stationary_run import evaluated, iterate
 from hjbjax.solvers.vanishing_discounts import FURTHER, follow, needs_a_way, warm
 from hjbjax.well_posedness import resting
 
@@ -47,6 +49,19 @@ class Settled(NamedTuple):
     origin: "Settled | None" = None
     coarser: CoarserAnswer | None = None
     note: str = ""
+
+    def without_actions(self) -> "Settled":
+        """The same result without its policy, if the policy follows from V, to free its memory."""
+        if self.task.keeps_actions or not self.task.on.players.exact:
+            return self
+        return self._replace(state=dataclasses.replace(self.state, policy=Greedy(jnp.zeros(()), (), ())))
+
+    def with_actions(self) -> "Settled":
+        """The same result with its policy, which is computed again if it was left out."""
+        if self.task.bare or jnp.ndim(self.state.policy.defect):
+            return self
+        policy = evaluated(self.running, self.state.value).policy
+        return self._replace(state=dataclasses.replace(self.state, policy=policy))
 
     @property
     def running(self) -> Task:

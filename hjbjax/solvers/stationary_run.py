@@ -74,7 +74,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
       The last state, its status, and the residuals of all steps, starting with the guess.
     """
     limit = clock.max_steps if most is None else min(most, clock.max_steps)
-    iteration = (RunInParts if task.division.axes else StationaryRun)(task, guess, limit)
+    iteration = _iteration(task, guess, limit)
     if most is not None:
         iteration.name += ", computing a guess"
         iteration.passing = most <= clock.max_steps
@@ -83,6 +83,18 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
     if status is Status.NONFINITE or status in CUT:
         state = with_obstacles(task, state)
     return state, status, np.concatenate(iteration.residuals)[: int(state.progress.evaluations)]
+
+
+def evaluated(task: Task, value: Nodes) -> State:
+    """The state of a value after its evaluation, by the program of the iteration, on any devices and at any time."""
+    iteration = _iteration(task, value, 0)
+    iteration.advance(1)
+    return iteration.gathered()
+
+
+def _iteration(task: Task, guess: Nodes, limit: int) -> "StationaryRun":
+    """The run of a task from a guess, on one device or on several."""
+    return (RunInParts if task.division.axes else StationaryRun)(task, guess, limit)
 
 
 def with_obstacles(task: Task, state: State) -> State:

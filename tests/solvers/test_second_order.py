@@ -161,6 +161,36 @@ def test_where_the_second_order_does_not_converge_the_monotone_answer_stands(fai
         hjb.solve(problem, grid, scheme=hjb.Limited())
 
 
+def pulled(x, u, d):
+    return u + d
+
+
+def charged(x, u, d):
+    return x @ x + u @ u - d @ d
+
+
+PLAYED = {
+    "formula": line(),
+    "stopping": line(stopping_cost=lambda x: 0.3 + 0 * x[0]),
+    "search": hjb.Problem(lambda x, u: jnp.sin(2 * u), square, U, discount=1.0),
+    "game": hjb.Problem(pulled, charged, U, disturbances=hjb.Box([-0.3], [0.3]), discount=1.0),
+}
+
+
+@pytest.mark.parametrize("name", ["formula", *(pytest.param(name, marks=pytest.mark.slow) for name in [*PLAYED][1:])])
+def test_the_monotone_answer_that_stands_has_its_policy(name, failing):
+    """The policy is not stored during the second-order iteration if it follows from V."""
+    problem, grid = PLAYED[name], hjb.Grid([-1.0], [1.0], (41,))
+    first = hjb.solve(problem, grid, scheme=hjb.Upwind(subcell=True))
+    lanes = hjb.solve_batch([problem, problem], grid)
+    for solution in (hjb.solve(problem, grid), *lanes):
+        assert "second-order iteration ended with STALLED" in solution.message or solution in lanes
+        for actions, expected in ((solution.policy, first.policy), (solution.disturbance, first.disturbance)):
+            assert (actions is None) == (expected is None)
+            if actions is not None:
+                np.testing.assert_allclose(actions, expected, atol=2e-3)
+
+
 @pytest.mark.slow
 def test_a_limit_that_only_the_first_order_keeps_to():
     problem, grid = zoo.smooth(shape=(25, 25))

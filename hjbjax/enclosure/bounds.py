@@ -47,6 +47,10 @@ class Bound:
             best = np.minimum(np.maximum(best, least), largest)
         return -best if self.negated else best
 
+    def with_candidate(self, coefficients: np.ndarray, levels: Levels) -> "Bound":
+        """The best of this bound and a function of one more spline."""
+        return dataclasses.replace(self, coefficients=(*self.coefficients, coefficients), levels=(*self.levels, levels))
+
     def negative(self) -> "Bound":
         """Minus the bound, which is a bound from the other side."""
         return dataclasses.replace(self, negated=not self.negated)

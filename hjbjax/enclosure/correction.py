@@ -25,6 +25,7 @@ from hjbjax.problem.pytree import altered
 REACH = 2  # cells by which a source is widened, and then smoothed, so that its E is smooth on the grid
 SHARE = 40  # the cells of an axis over its reach on fine grids: otherwise E falls too steeply across the paths
 MARGIN = 1.3  # a source is larger than the defect, because the chain spreads it
+MEAN = np.array([1, 3, 6, 7, 6, 3, 1]) / 27  # three means of three neighbours
 DIRECT = 2  # states up to which the linear equations are factored
 
 
@@ -74,6 +75,18 @@ def smooth_cover(excess: np.ndarray, grid: Grid) -> np.ndarray:
         mode, size = "wrap" if cyclic else "nearest", 2 * max(REACH, excess.shape[axis] // SHARE) + 1
         excess = uniform_filter1d(maximum_filter1d(excess, size, axis, mode=mode), size, axis, mode=mode)
     return MARGIN * excess
+
+
+def mollified(values: np.ndarray, grid: Grid) -> np.ndarray:
+    """Means over nearby nodes, three on both sides of each; linear functions do not change, also at the ends."""
+    from scipy.ndimage import correlate1d
+
+    for axis, cyclic in enumerate(grid.periodic):
+        pad = [(3 * (other == axis),) * 2 for other in range(grid.ndim)]
+        mode: dict[str, Any] = {"mode": "wrap"} if cyclic else {"mode": "reflect", "reflect_type": "odd"}
+        wide = correlate1d(np.pad(values, pad, **mode), MEAN, axis)
+        values = np.take(wide, range(3, wide.shape[axis] - 3), axis=axis)
+    return values
 
 
 def away_from(mask: np.ndarray, grid: Grid) -> np.ndarray:

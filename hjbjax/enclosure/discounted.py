@@ -7,7 +7,7 @@ earlier ones.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -23,14 +23,16 @@ from hjbjax.tracing.intervals import point
 
 SMOOTHING = 3  # defect corrections before the bounds part
 WIDENED = 5.0  # the level of a correction is the largest defect divided by this number
-FALLS = 0.7  # a defect correction must reduce the mean defect to this fraction
+FALLS = 0.7  # a correction of the defect must reduce its mean, and a smoother candidate the shift, to this fraction
 HELPS = 0.6  # a correction along the paths that leaves more than this fraction of the shift is compared with another
+SMOOTHER = 3  # the largest number of times that a candidate is smoothed
 STAGNANT = 2  # corrections without progress after which a bound is given up
 BISECTIONS = 2  # of the cells with the largest defects
 LARGEST = 0.5  # fraction of the largest defect from which on a cell is bisected
 SHARE = 0.03  # largest fraction of the cells that are bisected: their parts take as long as half of all cells
 WORTH = 0.97  # no cell is bisected if those below leave more than this fraction of the shift
 GAIN = 0.97  # a correction that leaves more than this fraction of the width is no progress
+Kept: TypeAlias = list[tuple[np.ndarray, float]]  # the candidates of a bound, and their shifts
 Move = Callable[[np.ndarray], np.ndarray]
 
 
@@ -121,9 +123,10 @@ class DiscountTask:
         Raises:
           ValueError: no bound is finite.
         """
-        kept: list[tuple[np.ndarray, float]] = []
+        kept: Kept = []
         best, stagnant = np.full(self.grid.shape, -np.inf), 0
         required = np.zeros(self.grid.shape)
+        values, found = self.start(values, found, sign)
         lead = self.lead(values, kept, sign)
         for turn in range(rounds):
             before = float(np.max(sizes_of(found, lead, sign)))
@@ -150,7 +153,23 @@ class DiscountTask:
         levels = tuple(Levels.shifted(shift, sign) for shift in shifts)
         return Bound(self.spline, coefficients, levels, sign), required
 
-    def lead(self, values: np.ndarray, kept: list[tuple[np.ndarray, float]], sign: int) -> np.ndarray:
+    def start(self, values: np.ndarray, found: Defects, sign: int) -> tuple[np.ndarray, Defects]:
+        """The candidate, or a smoother one that requires a far smaller shift, and its defects.
+
+        H is concave in the slope, so a mean of W over nearby states is as good a lower bound as W, apart from the
+        variation of the problem over this distance. It rounds kinks off, around which the spline of V oscillates.
+        """
+        for _ in range(SMOOTHER):
+            smoother = self.continued(correction.mollified(values, self.grid))
+            after = self.defects(smoother)
+            shifts = [float(np.max(sizes_of(each, np.inf, sign))) for each in (found, after)]
+            lost = float(np.mean(sign * (values - smoother)[self.chosen]))
+            if not (shifts[1] < FALLS * shifts[0] and shifts[1] + lost < shifts[0]):
+                break
+            values, found = smoother, after
+        return values, found
+
+    def lead(self, values: np.ndarray, kept: Kept, sign: int) -> np.ndarray:
         """The shift from which on a candidate is nowhere in a cell better than the bounds so far, shape (*cells)."""
         found = np.full(self.spline.shape, np.inf)
         for other, shift in kept:
@@ -159,7 +178,7 @@ class DiscountTask:
 
     def better(
         self, values: np.ndarray, found: Defects, excess: np.ndarray, move: Move,
-        kept: list[tuple[np.ndarray, float]], sign: int, enough: float,
+        kept: Kept, sign: int, enough: float,
     ) -> tuple[np.ndarray, Defects, np.ndarray, Move]:  # fmt: skip
         """A correction for an excess at the nodes, its defects, its lead, and the function for the next correction.
 
@@ -203,7 +222,7 @@ def at_nodes(function: Any, grid: Grid) -> np.ndarray:
     return np.asarray(jax.vmap(function)(nodes), float).reshape(grid.shape)
 
 
-def sizes_of(found: Defects, lead: np.ndarray, sign: int) -> np.ndarray:
+def sizes_of(found: Defects, lead: np.ndarray | float, sign: int) -> np.ndarray:
     """The shift that every cell requires, (*cells): its defect, or the lead if that is smaller."""
     return np.minimum(found.high if sign > 0 else -found.low, lead)
 

@@ -1,12 +1,13 @@
 """``enclose``: two functions between which the value of the continuous problem lies, with proof."""
 
+import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from hjbjax.enclosure import correction, defect, exits
+from hjbjax.enclosure import branches, correction, defect, exits
 from hjbjax.enclosure.bounds import Enclosure
 from hjbjax.enclosure.discounted import DiscountTask
 from hjbjax.enclosure.interpolant import Spline
@@ -91,10 +92,12 @@ def enclose(
         if own.target is None:
             blocks = defect.blocks(own, grid, spline, defect.all_cells(spline), 0)
             task = DiscountTask(own, grid, spline, blocks, scale * tol, chosen)
+            bound: Callable[..., Any] = functools.partial(branches.bound, task)
         else:
             task = exit_task(own, grid, spline, value, chosen, scale * tol)
+            bound = task.bound
         middle, found, move = task.corrected(value)
-        bounds = [task.bound(middle, found, move, sign, count) for sign in (1, -1)]
+        bounds = [bound(middle, found, move, sign, count) for sign in (1, -1)]
         remaining = task.remaining(bounds[1][0])
     if problem.payoff == REWARD:
         bounds = [(each.negative(), sizes) for each, sizes in reversed(bounds)]

@@ -7,6 +7,8 @@ import pytest
 import scipy.linalg
 
 import hjbjax as hjb
+from hjbjax.enclosure import branches, defect
+from hjbjax.enclosure.discounted import DiscountTask
 from hjbjax.enclosure.interpolant import Spline
 
 BETA = 0.7
@@ -198,6 +200,67 @@ def test_a_value_with_a_concave_kink_is_enclosed(controls):
         widths.append(np.median(found.width))
     assert widths[1] < 0.6 * widths[0]
     assert widths[1] < 0.12
+
+
+def test_the_bounds_at_a_concave_kink_are_as_near_as_elsewhere():
+    """A differentiable upper bound cannot touch it: the width at the kink was 1.7 times the range of V."""
+    problem = hjb.Problem(
+        lambda x, u: u, lambda x, u: jnp.minimum(jnp.abs(x[0] - 1), jnp.abs(x[0] + 1)), SETS[0], discount=1.0
+    )
+    found = hjb.enclose(problem, near(hjb.Grid([-2.0], [2.0], (161,)), wells))
+    assert check(found, wells, [-2.0], [2.0]) < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("direction", [[1.0, 0.0], [0.8, 0.6], [-0.6, 0.8]])
+def test_an_oblique_kink_is_enclosed(direction):
+    """The problem of ``wells`` along a direction, with controls in the unit disc."""
+    along = jnp.array(direction)
+
+    def value(x):
+        return wells((along @ x)[None])
+
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: jnp.abs(jnp.abs(along @ x) - 1), hjb.Ball(1.0, 2), discount=1.0)
+    grid = hjb.Grid([-2.0, -2.0], [2.0, 2.0], (101, 101))
+    found = hjb.enclose(problem, near(grid, value))
+    assert check(found, value, [-1.0, -1.0], [1.0, 1.0], 20_000) < 0.4  # further out a wall may be in the way
+
+
+def test_of_several_candidates_only_the_best_one_in_a_cell_must_be_a_bound():
+    """Two branches of V meet at a kink. Beyond it each is flat and far from a bound, and their minimum is V."""
+    problem = hjb.Problem(
+        lambda x, u: u, lambda x, u: jnp.minimum(jnp.abs(x[0] - 1), jnp.abs(x[0] + 1)), SETS[0], discount=1.0
+    )
+    grid = hjb.Grid([-0.9], [0.9], (91,))
+    x = grid.nodes()[:, 0]
+    clipped = [np.maximum(side * x, -0.1) for side in (-1, 1)]
+    sides = [np.exp(each - 1) - each for each in clipped]
+    with jax.enable_x64(True):
+        spline = Spline.on(grid)
+        blocks = defect.blocks(problem, grid, spline, defect.all_cells(spline), 0)
+        task = DiscountTask(problem, grid, spline, blocks, 1e-3, np.ones(grid.shape, bool))
+        found = [task.defects(each) for each in sides]
+        needs = branches.required(task, sides, found, -1)
+        alone = [float(np.max(-each.low)) for each in found]
+    assert min(alone) > 0.3
+    assert np.max(needs) < 1e-2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
+def test_a_pendulum_with_swings_is_enclosed():
+    """V has kinks along spirals. Both bounds were several ranges of V away from it."""
+    problem, fine = hjb.zoo.pendulum(discount=0.5, shape=(800, 801))
+    reference = hjb.solve(problem, fine)
+    found = hjb.enclose(problem, hjb.solve(problem, hjb.zoo.pendulum(shape=(200, 201))[1]))
+    nodes = fine.nodes().reshape(-1, 2)
+    low, high = found.lower_at(nodes), found.upper_at(nodes)
+    value, error = np.asarray(reference.value).ravel(), np.asarray(reference.grid_error).ravel()
+    extent = np.ptp(value)
+    assert np.all(low <= value + error)
+    assert np.all(value - error <= high)
+    assert np.median(value - low) < 0.03 * extent
+    assert np.median(high - value) < 0.15 * extent
 
 
 @pytest.mark.slow

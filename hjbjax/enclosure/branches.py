@@ -1,0 +1,131 @@
+"""Bounds at kinks: the best of several candidates, each of which continues V across kinks from one side.
+
+Where two ways of acting are equally good V has a concave kink, and a differentiable upper bound cannot touch it. But
+there V is the least of differentiable functions, one for each way of acting. On the other side of the kink such a
+function is about the extrapolation 2 V(x − s) − V(x − 2s), if s is longer than the distance over which a spline rounds
+the kink off. The extrapolations along both directions of every axis are candidates. In a cell only those have to be
+bounds that are the best somewhere in it.
+
+Each candidate is corrected along the paths of its own control, since they leave the kink to one side.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hjbjax.enclosure import correction
+from hjbjax.enclosure.bounds import Bound
+from hjbjax.enclosure.defect import Defects
+from hjbjax.enclosure.discounted import DiscountTask, Kept, Move, sizes_of
+from hjbjax.enclosure.levels import Levels
+from hjbjax.problem.grid import Grid
+
+FAR = 0.1  # fraction of the range of V: a bound that is further away somewhere is compared with other candidates ...
+MORE = 3  # ... which take this many times the corrections
+STEP = 8  # cells: the mean and the spline round a kink over about seven
+RISE = 0.5  # fraction of the range of V by which a candidate is worse where it reads beyond an end
+LEVEL = 3.0  # the level of a correction is the shift divided by this number
+STAGNANT = 5  # corrections without progress after which no more are made ...
+FALLS = 0.9  # ... where a smaller largest defect, by this factor, is progress too
+PROGRESS = 0.1  # fraction of the wanted width, or of the shift over ten, by which a correction must narrow the bound
+REFRESHED = 4  # corrections with the same factors of their equations
+
+
+def bound(
+    task: DiscountTask, values: np.ndarray, found: Defects, move: Move, sign: int, rounds: int
+) -> tuple[Bound, np.ndarray]:
+    """As ``DiscountTask.bound``, with one-sided candidates if the bound is far from V."""
+    narrow, sizes = task.bound(values, found, move, sign, rounds)
+    shifts = [-sign * float(each.values[0]) for each in narrow.levels]
+    kept = list(zip(narrow.coefficients, shifts, strict=True))
+    smooth = correction.mollified(values, task.grid)
+    for candidates in ([smooth], one_sided(smooth, task.grid, sign)):
+        distance = np.max((sign * values - _best(kept, sign))[task.chosen])
+        if distance <= FAR * np.ptp(values[task.chosen]):
+            break
+        kept += further(task, candidates, kept, sign, MORE * rounds)
+    for candidate, shift in kept[len(shifts) :]:
+        narrow = narrow.with_candidate(candidate, Levels.shifted(shift, sign))
+    return narrow, sizes
+
+
+def _best(kept: Kept, sign: int) -> np.ndarray:
+    """The bound at the nodes, shape (*grid); of an upper bound the negative."""
+    return np.max([sign * each - shift for each, shift in kept], axis=0)
+
+
+def one_sided(values: np.ndarray, grid: Grid, sign: int) -> list[np.ndarray]:
+    """The extrapolations of smooth values along both directions of every axis, shape (*grid) each.
+
+    Where one reads beyond an end of the box it is lowered (``sign`` 1, for lower bounds) or raised (−1).
+    """
+    found = []
+    for axis, cyclic in enumerate(grid.periodic):
+        count = grid.shape[axis]
+        if count < 4 * STEP:
+            continue
+        pad = [(2 * STEP * (other == axis),) * 2 for other in range(grid.ndim)]
+        wide = np.pad(values, pad, mode="wrap") if cyclic else np.pad(values, pad, mode="reflect", reflect_type="odd")
+        ramp = np.maximum(0, 1 - np.arange(count) / (2 * STEP)) ** 2 * (RISE * np.ptp(values) * (not cyclic))
+        for direction in (1, -1):
+            near, far = (np.take(wide, np.arange(count) + 2 * STEP - k * direction * STEP, axis=axis) for k in (1, 2))
+            steep = ramp[::direction].reshape([count if other == axis else 1 for other in range(grid.ndim)])
+            found.append(2 * near - far - sign * steep)
+    return found
+
+
+def further(task: DiscountTask, candidates: Sequence[np.ndarray], kept: Kept, sign: int, rounds: int) -> Kept:
+    """Corrections of several candidates that narrow the bound, with their shifts.
+
+    Args:
+      task: the data of the bounds.
+      candidates: the candidates, shape (*grid) each; none on few nodes.
+      kept: the candidates of the bound so far, and their shifts.
+      sign: 1 for a lower and −1 for an upper bound.
+      rounds: the largest number of corrections.
+    """
+    added: Kept = []
+    moves: list[Move] = []
+    best, worst, stagnant = _best(kept, sign), np.inf, 0
+    for turn in range(rounds if candidates else 0):
+        found = [task.defects(each) for each in candidates]
+        needs = required(task, candidates, found, sign)
+        largest = float(np.max(needs))
+        leads = [task.lead(each, [*kept, *added], sign) for each in candidates]
+        sizes = np.minimum(needs, leads)
+        shift = float(np.max(sizes))
+        if not np.isfinite(shift):
+            break
+        fresh = [(each, shift) for each in candidates]
+        better = np.maximum(best, _best(fresh, sign))
+        stagnant = 0 if largest < FALLS * worst else stagnant + 1
+        worst = min(worst, largest)
+        if np.mean((better - best)[task.chosen]) > PROGRESS * max(task.wanted, shift / 10):
+            best, stagnant = better, 0
+            added += fresh
+        if shift <= task.wanted / 4 or stagnant >= STAGNANT:
+            break
+        if turn % REFRESHED == 0:
+            moves = [task.mover(each) for each in found]
+        excess = [correction.on_nodes(np.maximum(each - shift / LEVEL, 0), task.grid) for each in sizes]
+        candidates = [
+            each - sign * move(correction.smooth_cover(source, task.grid)) if np.any(source) else each
+            for each, move, source in zip(candidates, moves, excess, strict=True)
+        ]
+    return added
+
+
+def required(
+    task: DiscountTask, candidates: Sequence[np.ndarray], found: Sequence[Defects], sign: int
+) -> list[np.ndarray]:
+    """The shift that every cell requires of every candidate, if all have the same shift, shape (*cells) each.
+
+    In a cell in which another candidate is better everywhere, nothing is required.
+    """
+    needs = []
+    for i, (each, defects) in enumerate(zip(candidates, found, strict=True)):
+        need = sizes_of(defects, np.inf, sign)
+        for other in (*candidates[:i], *candidates[i + 1 :]):
+            need = np.where(task.spline.largest(sign * (each - other)) < 0, 0, need)
+        needs.append(need)
+    return needs

@@ -209,11 +209,13 @@ def _check_parts(problem: "Problem", grid: "Grid", devices: tuple[int, ...], sch
 
 
 def _try_checkpoint(checkpoint: Path) -> None:
-    """Raise OSError if a checkpoint cannot be written."""
+    """Raise OSError if a checkpoint cannot be written, or if another run is using it."""
     from hjbjax.solution import files, placement
+    from hjbjax.solution.locked_file import LockedFile
 
     path = placement.absolute(files.with_suffix(os.fspath(checkpoint)))
-    placement.check_place(path, force=True)
+    with contextlib.closing(LockedFile(path)) as file:
+        file.take()
     with placement.new_file(path):
         pass
 

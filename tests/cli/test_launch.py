@@ -1,5 +1,6 @@
 """One solve by many processes and devices: refusals, the answer of one process, and a process that dies."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -18,6 +19,7 @@ from hjbjax.cli import children, launch, run_folder
 from hjbjax.cli.children import ChildEnds, End
 from hjbjax.cli.command_line import Failure
 from hjbjax.cli.main import main
+from hjbjax.solution.locked_file import LockedFile
 from hjbjax.solution.solution import Solution, Status
 
 ROOT = Path(__file__).parents[2]
@@ -111,6 +113,15 @@ def test_a_checkpoint_that_cannot_be_written_is_found_before_a_process_starts(ch
 
 
 @pytest.mark.usefixtures("_no_child")
+def test_a_checkpoint_that_another_run_is_using_is_found_before_a_process_starts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.npz").write_bytes(b"of the other run")
+    with contextlib.closing(LockedFile(str(tmp_path / "run.npz"))) as file:
+        file.take()
+        refused(("launch", "--", "solve", "pendulum", "--resume", "--checkpoint", "run"), "another run is using it", 5)
+
+
+@pytest.mark.usefixtures("_no_child")
 def test_more_nodes_than_indices_are_found_before_a_process_starts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(("launch", "--", "solve", "pendulum", "--shape", "100000x100000"), "10,000,000,000 nodes", 6)
@@ -134,7 +145,7 @@ def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pendulum").mkdir()
     (tmp_path / "pendulum" / "value.png").touch()
-    (tmp_path / "run.npz").touch()
+    (tmp_path / "run.npz").write_bytes(b"of an earlier run")
     monkeypatch.setattr(children, "run_children", lambda *_, **__: ChildEnds((End(0, 0), End(1, 0))))
     for more in (("--force", "--checkpoint", "run", "--resume"), ("--dry-run",)):
         assert CliRunner().invoke(main, ["launch", "--", "solve", "pendulum", *more]).exit_code == 0

@@ -75,16 +75,17 @@ class Fit(files.Saved):
         names = [jax.tree_util.keystr(where) for where, _ in leaves]
         arrays = {f"parameter{i}": np.asarray(leaf, float) for i, (_, leaf) in enumerate(leaves)}
         header = {
-            "names": names, "loss": self.loss, "status": int(self.status), "starts": self.starts,
+            "names": names, "shapes": [each.shape for each in arrays.values()], "loss": self.loss,
+            "status": int(self.status), "starts": self.starts,
             "gradient_error": self.gradient_error, "seconds": self.seconds,
         }  # fmt: skip
-        return header, {**arrays, "history": self.history}
+        return header, {**arrays, "history": np.asarray(self.history, float)}
 
     @staticmethod
     def _plan(header: dict) -> dict[str, files.Expected]:
         """The arrays of a file."""
-        shapes = tuple((None,) * axes for axes in range(5))
-        each = {f"parameter{i}": files.Expected(shapes, (np.float64,)) for i in range(len(header["names"]))}
+        shapes = {f"parameter{i}": tuple(each) for i, each in enumerate(header["shapes"])}
+        each = {name: files.Expected((shape,), (np.float64,), optional=False) for name, shape in shapes.items()}
         return {**each, "history": files.Expected(((None,),), (np.float64,), optional=False)}
 
     @classmethod

@@ -216,6 +216,22 @@ def check_launch(words: Sequence[str], processes: int, heartbeat: int) -> None:
             raise Failure(f"launch: got {option} {number}, wanted at most {most}")
 
 
+@contextlib.contextmanager
+def without_accelerators() -> Iterator[None]:
+    """Context in which JAX, unless it has started, starts on the processor only.
+
+    The launcher checks arguments, and would otherwise take the memory of the accelerators that its processes need.
+    """
+    import jax
+
+    usual = jax.config.values["jax_platforms"]
+    jax.config.update("jax_platforms", "cpu")
+    try:
+        yield
+    finally:
+        jax.config.update("jax_platforms", usual)
+
+
 def start_processes(words: Sequence[str], processes: int, heartbeat: int, result: Path) -> int:
     """Run a command of ``hjbjax`` in several processes on this host, and return its exit code.
 

@@ -178,9 +178,13 @@ def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
     from hjbjax.cli import run_folder
 
     out = given["out"] or Path(given["name"])
+    entry = catalogue()[given["name"]]
+    with processes_of.without_accelerators():
+        problem, grid = _build(entry, parameters_of(entry, given["settings"]), given["shape"])
     if not given["dry_run"]:
         processes_of.check_devices(given["devices"], processes)
-        _check_parts(given["name"], given["shape"], given["devices"] or (processes,))
+        if processes > 1 or given["devices"]:
+            _check_parts(problem, grid, given["devices"] or (processes,), given["scheme"])
         _check_places(out, *(given[key] for key in ("force", "checkpoint", "resume")))
         with _one_line_error(OSError, 2, "--out: "):
             run_folder.check_writable(out)
@@ -193,22 +197,25 @@ def launch(processes: int, heartbeat: int, words: tuple[str, ...]) -> None:
         raise SystemExit(code)
 
 
-def _check_parts(name: str, shape: tuple[int, ...] | None, devices: tuple[int, ...]) -> None:
-    """Raise Failure if the nodes cannot be divided over the devices, as far as the shape is known without JAX."""
+def _check_parts(problem: "Problem", grid: "Grid", devices: tuple[int, ...], scheme: str | None) -> None:
+    """Raise Failure if the nodes are too many, or cannot be divided over the devices."""
     from hjbjax.problem import arguments
+    from hjbjax.tracing import checks
 
-    shape = shape or catalogue()[name].parameters["shape"]
-    if shape is not None:
-        with _one_line_error(ValueError, 2):
-            arguments.check_parts(devices, shape, "solve")
+    choices = _given({"scheme": scheme}).values()
+    with _one_line_error(ValueError, 2), _one_line_error(MemoryError, 6):
+        arguments.check_count(grid.shape)
+        checks.check_division(problem, grid, devices, "solve", *choices)
 
 
 def _try_checkpoint(checkpoint: Path) -> None:
-    """Raise OSError if a checkpoint cannot be written."""
+    """Raise OSError if a checkpoint cannot be written, or if another run is using it."""
     from hjbjax.solution import files, placement
+    from hjbjax.solution.locked_file import LockedFile
 
     path = placement.absolute(files.with_suffix(os.fspath(checkpoint)))
-    placement.check_place(path, force=True)
+    with contextlib.closing(LockedFile(path)) as file:
+        file.take()
     with placement.new_file(path):
         pass
 

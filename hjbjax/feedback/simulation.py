@@ -145,21 +145,21 @@ def simulate(
             problem, feedback, jnp.asarray(x0, jnp.result_type(float)), times, key=noise_key(problem, key), hold=held,
             rtol=rtol, atol=atol, max_step=max_step, max_steps=max_steps, due=due, **options,
         )  # fmt: skip
-    problem, feedback, disturbance, grid = _over_modes(problem, feedback, disturbance, grid, np.size(x0))
-    loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
-    start = _initial_state(with_first_mode(modes, x0, mode, "simulate"), loop.grid)
-    loop = dataclasses.replace(loop, problem=with_any_control(problem, start.size))
-    loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
     hold = None if hold is False else hold
     times = _times(duration, steps, hold)
     stepping = _stepping(rtol, atol, max_step, max_steps, held=hold is not None)
-    key = noise_key(problem, key)
     # importing diffrax changes JAX's configuration, which is part of the key of every compiled function; do it before
     # the first compilation, otherwise the second call compiles again
     import diffrax  # noqa: F401
 
     clock = Clock()
     with noting_interrupts(clock), own_settings(x64=True):
+        problem, feedback, disturbance, grid = _over_modes(problem, feedback, disturbance, grid, np.size(x0))
+        key = noise_key(problem, key)
+        loop = _close(problem, feedback, disturbance, grid, clamp, time_varying, due)
+        start = _initial_state(with_first_mode(modes, x0, mode, "simulate"), loop.grid)
+        loop = dataclasses.replace(loop, problem=with_any_control(problem, start.size))
+        loop = settled_loop(loop, start.size, {"control": feedback, "opponent": disturbance})
         loop = cast(loop, np.float64)  # a float32 solution also closes the loop in float64, like the integration
         check_shapes(loop, start)
         _check_start(loop, start)

@@ -307,29 +307,12 @@ def check_count(shape: tuple[int, ...]) -> None:
         )
 
 
-def check_mesh(mesh: object, grid_shape: tuple[int, ...], caller: str, *choices: Any) -> Mesh | None:
-    """The mesh, after checking that the nodes, and these ``choices``, can be divided over it; None for one device.
+def check_parts(counts: tuple[int, ...], grid_shape: tuple[int, ...], caller: str, *choices: Any) -> None:
+    """Check that the nodes, with these ``choices``, can be divided into these numbers of parts along the axes.
 
     Raises:
-      TypeError: an argument that is not a mesh.
-      ValueError: more axes than the grid has, parts with too few nodes, or a choice that does not support parts.
-    """
-    mesh = as_mesh(mesh, caller)
-    check_parts(mesh.devices.shape, grid_shape, caller)
-    for choice in choices:
-        if not choice.in_parts:
-            raise ValueError(
-                f"{caller}: {choice!r} runs on one device; leave out mesh. A class that reads other nodes only by "
-                "hjbjax.discretisation.stencil, and reduces by grid.layout, may set in_parts = True"
-            )
-    return mesh if mesh.size > 1 else None
-
-
-def check_parts(counts: tuple[int, ...], grid_shape: tuple[int, ...], caller: str) -> None:
-    """Check that the nodes can be divided into these numbers of parts along the axes.
-
-    Raises:
-      ValueError: more numbers than the grid has axes, or parts with too few nodes.
+      ValueError: more numbers than the grid has axes, parts with too few nodes, or a choice that does not support
+        parts.
     """
     if len(counts) > len(grid_shape):
         raise ValueError(
@@ -341,6 +324,12 @@ def check_parts(counts: tuple[int, ...], grid_shape: tuple[int, ...], caller: st
             raise ValueError(
                 f"{caller}: mesh divides the {count} points of axis {axis} into {size} parts; wanted at least {FEWEST} "
                 f"points per part, so at most {count // FEWEST} parts"
+            )
+    for choice in choices:
+        if not choice.in_parts:
+            raise ValueError(
+                f"{caller}: {choice!r} runs on one device; leave out mesh. A class that reads other nodes only by "
+                "hjbjax.discretisation.stencil, and reduces by grid.layout, may set in_parts = True"
             )
 
 

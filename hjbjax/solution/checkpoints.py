@@ -411,14 +411,19 @@ def _begin_together(target: LockedFile, question: Mapping[str, str], *, resume: 
 
 @contextlib.contextmanager
 def _in_all_processes(path: str) -> Iterator[None]:
-    """Context that all processes leave together: an exception in one of them raises in all, so no process waits."""
+    """Context that all processes leave together: an exception in one of them raises in all, so no process waits.
+
+    The others raise the same type, FileExistsError or FileError, because a command has an exit code for each.
+    """
     try:
         yield
-    except Exception:
-        agreed(0)
+    except Exception as error:
+        agreed(-1 if isinstance(error, FileExistsError) else 0)
         raise
-    if not agreed(1):
-        raise FileError(f"{path}: another process of this run could not open it")
+    outcome = agreed(1)
+    if outcome < 1:
+        kind = FileExistsError if outcome < 0 else FileError
+        raise kind(f"{path}: another process of this run could not open it")
 
 
 def describe_question(problems: Sequence[Problem], grid: Grid, **others: Any) -> dict[str, str]:

@@ -323,13 +323,21 @@ class Saved(abc.ABC):
         Raises:
           FileExistsError: the file exists, without ``force``.
           FileError: the file cannot be written.
-          ValueError: the result is traced, or contains a function that a file cannot hold.
+          ValueError: the result is traced, or contains a function or an array that a file cannot hold.
         """
         if is_traced(self):
             name = type(self).__name__
             raise ValueError(f"{name}.save: got a traced solution; save it outside of jit, vmap and grad")
         header, arrays = self._contents()
+        self._check_readable(header, arrays)
         write(path, {"format": self.FORMAT, "version": self.VERSION, **header}, arrays, force=force)
+
+    def _check_readable(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        """Raise ValueError if ``load`` would refuse the arrays, which would be lost in the file."""
+        expected = self._plan(json.loads(json.dumps({**header, "arrays": sorted(arrays)}, default=_plain)))
+        for name, array in arrays.items():
+            if complaint := expected[name].complaint(np.shape(array), np.asarray(array).dtype.str):
+                raise ValueError(f"{type(self).__name__}.save: {name} {complaint}")
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -38,8 +38,8 @@ def path_of(path: Path, done: str) -> str:
     """The name of a file as text.
 
     Args:
+      path: the name.
       done: the intended operation, such as "read".
-      done: what was to be done with the file, as in "read".
 
     Raises:
       FileError: not a path, or one that no system accepts: with a null byte, or with half of a surrogate pair.

@@ -409,6 +409,8 @@ class Solution:
         Copy ``hjbjax/solution/numpy_feedback.py`` next to your code. Its ``load(path)`` returns an object whose
         ``value(x)`` and ``control(x)``, or ``(t, x)`` after ``march``, equal ``value_at`` and ``control_at`` up to
         rounding. Its docstring describes the file format, for other languages. ``hjb.load`` does not read the file.
+        A loaded solution does not have its problem, which determines where the controller changes the mode; set it
+        first with ``dataclasses.replace(solution, problem=problem)``.
 
         Raises:
           FileExistsError: the file exists; choose another name or pass ``force=True``.

@@ -13,7 +13,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hjbjax.problem import sets
-from hjbjax.problem.arguments import as_mesh, check_count, check_mesh
+from hjbjax.problem.arguments import as_mesh, check_count, check_parts
 from hjbjax.problem.ends import KINDS
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.mode_axis import refuse_modes
@@ -365,19 +365,38 @@ def over_devices(
         return None
     if traced:
         raise ValueError(f"{caller}: mesh divides the nodes at host level only; leave it out inside jit, vmap and grad")
-    for present, what, why in (
-        (bool(problem.push_steps), "pushes", "a node may be pushed through the nodes of several devices"),
-        (problem.switching_costs is not None, "a switching_cost", "a node may change its mode several times"),
-        (problem.landings is not None, "jumps", "a jump may land on a node of any device"),
-    ):
-        if present:
-            raise ValueError(f"{caller}: got a mesh and a problem with {what}: {why}. Leave out mesh")
-    refuse_prescribed(grid, caller, "whose numbers are not divided over a mesh")
+    mesh = as_mesh(mesh, caller)
+    check_division(problem, grid, mesh.devices.shape, caller, *choices)
     if problem_calls_back(problem, grid.ndim):
         raise ValueError(
             f"{caller}: a function of the problem calls Python on the host; leave out mesh, or write it in JAX"
         )
     if grid.modes:  # every device has all modes of its nodes
-        mesh = as_mesh(mesh, caller)
         mesh = Mesh(mesh.devices[None], ("modes of the problem", *mesh.axis_names))
-    return check_mesh(mesh, grid.shape, caller, *choices)
+    return mesh if mesh.size > 1 else None
+
+
+def check_division(problem: Problem, grid: Grid, counts: tuple[int, ...], caller: str, *choices: Any) -> None:
+    """Check that the nodes can be divided into these numbers of parts along the axes, without tracing the problem.
+
+    Raises:
+      ValueError: they cannot, or the problem or one of the choices works on one device only.
+    """
+    own = None if problem.modes is None else problem.modes.switching_cost  # before the modes become an axis
+    for present, what, why in (
+        (
+            bool(problem.push_steps or problem.pushes),
+            "pushes",
+            "a node may be pushed through the nodes of several devices",
+        ),
+        (
+            any(each is not None for each in (own, problem.switching_costs)),
+            "a switching_cost",
+            "a node may change its mode several times",
+        ),
+        (problem.landings is not None or bool(problem.jumps), "jumps", "a jump may land on a node of any device"),
+    ):
+        if present:
+            raise ValueError(f"{caller}: got a mesh and a problem with {what}: {why}. Leave out mesh")
+    refuse_prescribed(grid, caller, "whose numbers are not divided over a mesh")
+    check_parts((1, *counts) if grid.modes else counts, grid.shape, caller, *choices)

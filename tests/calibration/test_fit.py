@@ -73,6 +73,12 @@ def test_a_time_limit_keeps_the_best_parameters_and_a_file_brings_them_back(tmp_
     assert np.array_equal(back.parameters["['b']"], found.parameters["b"])
 
 
+def test_parameters_with_many_axes_come_back(tmp_path):
+    start = np.arange(6.0).reshape(1, 3, 1, 1, 2, 1)
+    hjb.fit(lambda p: jnp.sum((p - start) ** 2), start, steps=1).save(tmp_path / "fit")
+    assert np.array_equal(hjb.Fit.load(tmp_path / "fit").parameters[""], start)
+
+
 @pytest.mark.slow
 def test_a_design_with_a_known_optimum():
     """x' = b u, cost x² + u²: V = x²/b, so V(1) + 4 b is least at b = ½, where it is 4."""

@@ -1,5 +1,6 @@
 """One solve by many processes and devices: refusals, the answer of one process, and a process that dies."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -18,6 +19,7 @@ from hjbjax.cli import children, launch, run_folder
 from hjbjax.cli.children import ChildEnds, End
 from hjbjax.cli.command_line import Failure
 from hjbjax.cli.main import main
+from hjbjax.solution.locked_file import LockedFile
 from hjbjax.solution.solution import Solution, Status
 
 ROOT = Path(__file__).parents[2]
@@ -72,6 +74,12 @@ def _no_child(monkeypatch):
         (("--processes", "30", "--", "solve", "bang-bang", "--shape", "41"), "at most 13 parts"),
         (("--processes", "90", "--", "solve", "pendulum"), "the 200 points of axis 0 into 90 parts"),
         (("--", "solve", "bang-bang", "--devices", "2x1"), "got a mesh of 2 axes, (2, 1), wanted at most 1"),
+        (("--", "solve", "bang-bang", "--shape", "41x41"), "got 2 sizes, but bang-bang has 1 axes"),
+        (("--", "solve", "pendulum", "--set", "trque=2"), "did you mean 'torque'?"),
+        (("--", "solve", "pendulum", "--set", "torque=-1"), "no admissible control: input 0 has lo = 1 > hi = -1"),
+        (("--", "solve", "pendulum", "--scheme", "semi-lagrangian"), "runs on one device; leave out mesh"),
+        (("--", "solve", "thermostat"), "got a mesh and a problem with a switching_cost"),
+        (("--", "solve", "pendulum", "--dry-run", "--shape", "9"), "got 1 sizes, but pendulum has 2 axes"),
         (("--", "solve", "pendulm"), "did you mean 'pendulum'?"),
         (("--", "solve", "pendulum", "--tol", "nan"), "got 'nan', wanted a finite number > 0"),
         (("--", "solve"), "Missing argument 'NAME'"),
@@ -104,12 +112,40 @@ def test_a_checkpoint_that_cannot_be_written_is_found_before_a_process_starts(ch
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("_no_child")
+def test_a_checkpoint_that_another_run_is_using_is_found_before_a_process_starts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.npz").write_bytes(b"of the other run")
+    with contextlib.closing(LockedFile(str(tmp_path / "run.npz"))) as file:
+        file.take()
+        refused(("launch", "--", "solve", "pendulum", "--resume", "--checkpoint", "run"), "another run is using it", 5)
+
+
+@pytest.mark.usefixtures("_no_child")
+def test_more_nodes_than_indices_are_found_before_a_process_starts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused(("launch", "--", "solve", "pendulum", "--shape", "100000x100000"), "10,000,000,000 nodes", 6)
+
+
+@pytest.mark.slow  # it needs a process in which JAX has not started
+def test_the_launcher_leaves_the_accelerators_to_its_processes(tmp_path):
+    """A platform that does not exist stops JAX where it asks for anything but the processor."""
+    code = (
+        "import jax, sys; from hjbjax.cli import launch; from hjbjax.cli.main import main\n"
+        "launch.start_processes = lambda *_: print(jax.devices()[0].platform) or 0\n"
+        "main(['launch', '--', 'solve', 'stochastic-lq'])\n"
+    )
+    environment = {**os.environ, "JAX_PLATFORMS": "nowhere"}
+    found = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert (found.returncode, found.stdout) == (0, "cpu\n"), found.stderr
+
+
 def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):
     """What is refused above, with --force and --resume; and a dry run, which writes nothing."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pendulum").mkdir()
     (tmp_path / "pendulum" / "value.png").touch()
-    (tmp_path / "run.npz").touch()
+    (tmp_path / "run.npz").write_bytes(b"of an earlier run")
     monkeypatch.setattr(children, "run_children", lambda *_, **__: ChildEnds((End(0, 0), End(1, 0))))
     for more in (("--force", "--checkpoint", "run", "--resume"), ("--dry-run",)):
         assert CliRunner().invoke(main, ["launch", "--", "solve", "pendulum", *more]).exit_code == 0

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 
 import hjbjax as hjb
 from hjbjax.feedback.simulation import rollout
+from hjbjax.problem.mode_axis import with_modes
 
 pytestmark = pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 LINE = hjb.Grid([-2.0], [2.0], (41,))
@@ -518,3 +519,17 @@ def test_no_change_leads_to_a_mode_that_never_arrives():
     found = hjb.solve(problem, grid)
     assert np.allclose(found.value[0], grid.axis(0), atol=1e-6)
     assert np.all(np.isinf(found.value[1]))
+
+
+@pytest.mark.parametrize("x64", [False, True])
+def test_a_large_value_is_compared_in_float64(x64):
+    """V_a = 1000 + x and V_b = 1000: from x = 0 at speed 1 the controller pays 1 for the change at x = 1, and rests."""
+    modes = hjb.Modes(("a", "b"), switching_cost=[[0.0, 1.0], [1.0, 0.0]])
+    problem = hjb.Problem(lambda x, u, mode: 0 * x + 1.0 - mode, lambda x, u, mode: 1.0, discount=1.0, modes=modes)
+    grid = hjb.Grid([0.0], [2.0], (3,))
+    value = np.stack([1000.0 + grid.axis(0), np.full(3, 1000.0)])
+    solution = hjb.Solution(with_modes(grid, modes.names), value, None)
+    with jax.enable_x64(x64):
+        path = hjb.simulate(problem, solution, [0.0], 1.5, mode="a")
+    assert path.modes[-1] == 1
+    assert abs(path.states[-1, 0] - 1.0) < 1e-9

@@ -451,3 +451,32 @@ def test_sizes_in_the_table_of_contents_are_not_believed(tmp_path):
     data[entry + 20 : entry + 24] = (1).to_bytes(4, "little")
     path.write_bytes(data)
     refused(path, "declares two sizes")
+
+
+class Cubes(files.Saved):
+    """A result whose ``load`` accepts at most one axis."""
+
+    FORMAT = "test.Cubes"
+
+    def __init__(self, array):
+        self.array = array
+
+    def _contents(self):
+        return {}, {"array": self.array}
+
+    @staticmethod
+    def _plan(header):
+        return {"array": files.Expected(((), (None,)))}
+
+    @classmethod
+    def _from_file(cls, header, arrays):
+        return cls(arrays["array"])
+
+
+def test_a_result_that_could_not_be_read_again_is_not_written(tmp_path):
+    Cubes(np.arange(3.0)).save(tmp_path / "line")
+    assert Cubes.load(tmp_path / "line").array.tolist() == [0.0, 1.0, 2.0]
+    for array in (np.zeros((2, 2)), np.zeros(2, complex)):
+        with pytest.raises(ValueError, match=r"Cubes.save: array has (shape|dtype)"):
+            Cubes(array).save(tmp_path / "square")
+    assert [each.name for each in tmp_path.iterdir()] == ["line.npz"]

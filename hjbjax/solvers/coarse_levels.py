@@ -108,9 +108,13 @@ def below(grid: Grid, method: Method) -> Grid | None:
 
 def comparison_grid_of(task: Task) -> Grid | None:
     """The coarser grid for the estimate of the error of the task's grid; None if there is none."""
-    # which nodes cannot reach the target is known only for nodes of the finer grid
-    fixed = np.broadcast_to(np.asarray(task.obstacles.fixed), task.grid.shape)
-    return nested_grids.comparison_grid(task.grid, fixed, nested=task.has_lost)
+    counted = np.broadcast_to(np.asarray(task.counted), task.grid.shape)
+    return nested_grids.comparison_grid(task.grid, _ends(task), ~counted if task.has_lost else None)
+
+
+def _ends(task: Task) -> np.ndarray:
+    """The nodes with a fixed finite value, (*grid): unreachable nodes are fixed too, at a value above all others."""
+    return np.broadcast_to(np.asarray(task.obstacles.fixed & task.counted), task.grid.shape)
 
 
 def on_coarser(task: Task, coarse: Grid) -> Task | None:
@@ -143,7 +147,7 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
             made = at_order(made, first=bool(np.asarray(task.first_order)))
         elif not task.scheme.monotone:
             made = sharpened(made)
-    held, kept = (bool(np.any(np.asarray(each.obstacles.fixed))) for each in (task, made))
+    held, kept = (bool(np.any(_ends(each))) for each in (task, made))
     return None if held and not kept else made
 
 

@@ -35,31 +35,33 @@ def coarser(grid: Grid, fewest: int = FEWEST) -> Grid | None:
     return with_faces_of(grid, resized(grid, shape))
 
 
-def comparison_grid(grid: Grid, held: np.ndarray, *, nested: bool = False) -> Grid | None:
+def comparison_grid(grid: Grid, held: np.ndarray, lost: np.ndarray | None = None) -> Grid | None:
     """The coarser grid for the estimate of the error of ``grid``; None if an axis has too few intervals.
 
     It has about half the intervals per axis. Every fixed node, or a fixed neighbour of it, must lie in a coarse cell
-    with a fixed corner, since a grid that loses a one-node target poses another problem. An axis with two nodes is not
-    coarsened.
+    with a fixed corner, since a grid that loses a one-node target poses another problem. The same holds for the
+    unreachable nodes. An axis with two nodes is not coarsened.
 
     Args:
       grid: the grid.
-      held: the fixed nodes, bool (*grid).
-      nested: require that all coarse nodes are nodes of ``grid``.
+      held: the nodes with a fixed finite value, bool (*grid).
+      lost: the unreachable nodes, bool (*grid); None if there cannot be any. Whether a node is unreachable is known
+        only at the nodes of ``grid``, so all coarse nodes are then nodes of ``grid``.
     """
     many = [axis for axis in grid.state_axes if grid.shape[axis] > 2 or grid.periodic[axis]]
-    choices = {axis: _fewer(grid.intervals(axis), nested) for axis in many}
+    choices = {axis: _fewer(grid.intervals(axis), lost is not None) for axis in many}
+    kinds = [held] if lost is None else [held, lost]
     if not choices or not all(choices.values()):
         return None
     coarse = _resized(grid, {axis: tried[0] for axis, tried in choices.items()})
-    if not _keeps(held, grid, coarse):
+    if not _keeps(kinds, grid, coarse):
         # each axis separately, since there are too many combinations
-        kept = {axis: [few for few in tried if _keeps(held, grid, _resized(grid, {axis: few}))][:1]
+        kept = {axis: [few for few in tried if _keeps(kinds, grid, _resized(grid, {axis: few}))][:1]
                 for axis, tried in choices.items()}  # fmt: skip
         if not all(kept.values()):
             return None
         coarse = _resized(grid, {axis: few for axis, (few,) in kept.items()})
-        if not _keeps(held, grid, coarse):
+        if not _keeps(kinds, grid, coarse):
             return None
     return with_faces_of(grid, coarse)
 
@@ -92,14 +94,19 @@ def resized(grid: Grid, shape: Sequence[int]) -> Grid:
     return with_modes(bare, grid.modes) if grid.modes else bare
 
 
-def _keeps(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
-    """True if every fixed node, or a fixed neighbour of it, lies in a coarse cell with a fixed corner."""
+def _keeps(kinds: Sequence[np.ndarray], fine: Grid, coarse: Grid) -> bool:
+    """True if the coarser grid keeps each kind of nodes, see ``_keeps_nodes``."""
+    return all(_keeps_nodes(held, fine, coarse) for held in kinds)
+
+
+def _keeps_nodes(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
+    """True if every node of ``held``, or a neighbour of it in ``held``, lies in a coarse cell with a corner in it."""
     if not np.any(held):
         return True
     # in single precision, which is exact for nodes that coincide
     known = prolong(held.astype(np.float32), fine, coarse) > 1 - SINGLE
     kept = held & (prolong(known.astype(np.float32), coarse, fine) > ROUNDING)
-    for axis in fine.state_axes:  # a fixed node next to a kept one counts as kept, such as the tip of a disc
+    for axis in fine.state_axes:  # a node next to a kept one counts as kept, such as the tip of a disc
         along = np.moveaxis(kept, axis, 0)
         wide = along.copy()
         wide[1:] |= along[:-1]

@@ -231,10 +231,9 @@ def test_of_several_candidates_only_the_best_one_in_a_cell_must_be_a_bound():
     problem = hjb.Problem(
         lambda x, u: u, lambda x, u: jnp.minimum(jnp.abs(x[0] - 1), jnp.abs(x[0] + 1)), SETS[0], discount=1.0
     )
-    grid = hjb.Grid([-0.9], [0.9], (91,))
-    x = grid.nodes()[:, 0]
-    clipped = [np.maximum(side * x, -0.1) for side in (-1, 1)]
-    sides = [np.exp(each - 1) - each for each in clipped]
+    grid = hjb.Grid([-2.0], [2.0], (201,))
+    distances = [np.abs(np.maximum(side * grid.nodes()[:, 0], -0.1) - 1) for side in (-1, 1)]
+    sides = [each - 1 + np.exp(-each) for each in distances]
     with jax.enable_x64(True):
         spline = Spline.on(grid)
         blocks = defect.blocks(problem, grid, spline, defect.all_cells(spline), 0)

@@ -143,3 +143,11 @@ def test_a_slow_way_beside_a_fast_current(fast):
     solution = hjb.solve(problem, grid, tol=0.03, scheme=hjb.Upwind())
     cells = np.arange(15, 0, -1)
     assert np.allclose(solution.value[:15], cells * 0.59 * 0.2 / (0.0284 * 0.152), atol=0.03)
+
+
+@pytest.mark.filterwarnings("ignore:.*cannot reach")
+def test_a_rest_node_among_unreachable_nodes_that_no_coarser_grid_has():
+    problem, grid = hjb.Problem(lambda x, u: x, lambda x, u: x @ x), hjb.Grid([-1.0], [1.0], (15,))
+    solution = hjb.solve(problem, grid)
+    np.testing.assert_array_equal(solution.value, np.where(np.arange(15) == 7, 0.0, np.inf))
+    assert solution.grid_error is None

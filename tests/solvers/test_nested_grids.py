@@ -61,7 +61,7 @@ def test_the_grid_that_tells_the_error_keeps_the_held_node(shape, nested, wanted
     grid, held = hjb.Grid([-1.0, -1.0], [1.0, 1.0], shape), np.zeros(shape, bool)
     if all(count % 2 for count in shape):
         held[shape[0] // 2, shape[1] // 2] = True
-    coarse = nested_grids.comparison_grid(grid, held, nested=nested)
+    coarse = nested_grids.comparison_grid(grid, held, np.zeros(shape, bool) if nested else None)
     assert (None if coarse is None else coarse.shape) == wanted
 
 
@@ -72,6 +72,12 @@ def test_a_second_target_is_not_lost_either():
     assert coarse is None or np.min(np.abs(np.asarray(coarse.axis(0)) - 13 / 40)) < 1e-9
     held[13:20] = True  # a wide one is on any grid
     assert nested_grids.comparison_grid(grid, held).shape == (21,)
+
+
+def test_a_target_among_unreachable_nodes_is_not_lost():
+    held = np.zeros(15, bool)
+    held[7] = True  # the middle of 14 intervals is not a node of 7
+    assert nested_grids.comparison_grid(hjb.Grid([-1.0], [1.0], (15,)), held, ~held) is None
 
 
 def test_the_tip_of_a_disc_is_kept_with_the_disc():

@@ -113,7 +113,7 @@ def _sides(index: Index, spline: Spline) -> list[np.ndarray]:
     return [np.where(i == 0, -1, np.where(i == cells - 1, 1, 0)) for i, cells in pairs]
 
 
-def parts_of(grid: Grid, spline: Spline, index: Index, depth: int) -> Cells:
+def parts_of(grid: Grid, spline: Spline, index: Index, depth: int, stopped: Sequence[int] = ()) -> Cells:
     """The parts of some cells inside the box, 2^depth along every axis, the parts of one cell after each other.
 
     Args:
@@ -121,8 +121,9 @@ def parts_of(grid: Grid, spline: Spline, index: Index, depth: int) -> Cells:
       spline: its cells.
       index: the number of each cell along every axis.
       depth: the number of bisections along every axis.
+      stopped: axes along which only the middle of a cell counts, which is a node.
     """
-    ends = _parts(grid, _sides(index, spline), [depth] * grid.ndim, ())
+    ends = _parts(grid, _sides(index, spline), [depth] * grid.ndim, stopped)
     return spline.cells([np.repeat(i, 2 ** (depth * grid.ndim)) for i in index], ends)
 
 
@@ -191,7 +192,11 @@ def over_block(block: CellBlock, values: np.ndarray) -> tuple[Interval, np.ndarr
       block: the parts.
       values: the coefficients of W.
     """
-    w, p = block.cells.scalars(values)
+    return over_forms(block, *block.cells.scalars(values))
+
+
+def over_forms(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:
+    """The same for W and its gradient over these parts."""
     if block.known.problem.is_game:
         return _over_block_of_game(block, w, p)
     every = frozenset(block.walls)

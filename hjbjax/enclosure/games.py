@@ -9,6 +9,7 @@ also in either order. The bounds of the value that follow are those that the pla
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from hjbjax.enclosure.minimum import Cell, Functions, least_over, rate_and_unit
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.sets import Finite
+from hjbjax.problem.sets import Box, Finite
 from hjbjax.tracing import quadratics as qu
 from hjbjax.tracing import taylor_forms as tf
 from hjbjax.tracing.intervals import Interval
@@ -228,6 +229,46 @@ def _policy(
         for player, index, key in ((control, u, -1), (disturbance, d, 1))
     ]  # fmt: skip
     return np.concatenate(inputs, axis=-1)
+
+
+def by_vertices(cell: Cell) -> Interval | None:
+    """The range of −H if G is affine in the inputs of boxes or has finite sets; ``None`` otherwise.
+
+    H is then a minimum, or a saddle, over the vertices. For one vertex of both players G is as smooth as W, so that its
+    range is narrower than that of H near a kink. For all vertices U and D
+
+        min_d max_u sup(−G) ≥ −H ≥ max_u min_d inf(−G).
+    """
+    known = cell.functions
+    rows = [_gain(cost, drift, cell.p, frozenset()) for cost, drift in known.options]
+    control, disturbance = players(known.problem)
+    corners = [_corners(player) for player in (control, disturbance)]
+    if not rows or any(len(term) > 1 for terms in rows for term in terms) or None in corners:
+        return None
+    lo: Any = []
+    hi: Any = []
+    for k in range(0, len(rows), len(disturbance.arguments())):
+        for u in corners[0] or []:
+            own = [
+                disturbance.committed(control.committed(terms, u), d)
+                for terms in rows[k : k + len(disturbance.arguments())] for d in corners[1] or []
+            ]  # fmt: skip
+            found = [each.get((), tf.constant(0.0)).bounds(known.radii) for each in own]
+            lo.append([-each.hi for each in found])
+            hi.append([-each.lo for each in found])
+    least = np.max(np.stack([np.min(np.stack(np.broadcast_arrays(*row)), axis=0) for row in lo]), axis=0)
+    columns = [np.max(np.stack(np.broadcast_arrays(*each)), axis=0) for each in zip(*hi, strict=True)]
+    return Interval(least, np.min(np.stack(columns), axis=0))
+
+
+def _corners(player: Player) -> list[list[np.ndarray]] | None:
+    """The vertices of a box, one empty list if there are no inputs, or ``None`` for another set."""
+    if player.admissible is None:
+        return [[]]
+    if not isinstance(player.admissible, Box):
+        return None
+    ends = zip(np.asarray(player.admissible.lo, float), np.asarray(player.admissible.hi, float), strict=True)
+    return [[np.asarray(end) for end in each] for each in itertools.product(*ends)]
 
 
 def subsets(walls: dict[int, np.ndarray]) -> dict[frozenset[int], np.ndarray]:

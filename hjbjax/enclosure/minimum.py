@@ -37,7 +37,8 @@ class Functions:
       x: the state.
       radii: the largest distance from the centre along every axis.
       rate: the discount.
-      unit: the positive number by which a defect is divided: the discount, or without one a lower bound of the cost.
+      unit: the positive number by which a defect is divided: the discount, or without one a lower bound of the cost,
+        or one in a tube.
       options: cost and drift as polynomials of the control, or for every action of a finite set; empty if they are not
         quadratic polynomials.
     """
@@ -115,6 +116,8 @@ def rate_and_unit(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> t
     (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
     if is_discounted(problem):  # an interval that contains zero makes the defect infinite
         return rate, rate.range
+    if problem.target is None:  # a tube, where only the sign of the defect counts
+        return rate, point(1.0)
     least = _running_cost(problem, x, *any_actions(problem)).bounds(radii).lo
     return rate, point(np.maximum(least, 0.0))
 

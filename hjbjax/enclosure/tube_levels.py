@@ -1,4 +1,4 @@
-"""What the cells of time and space require of the levels that bound a marched tube.
+"""The conditions of the cells of time and space on the levels that bound a marched tube.
 
 Let W(t, x) be a spline in time and space near the value of
 
@@ -50,7 +50,7 @@ def with_given_time(drift: Callable, z: Array, *inputs: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Sides:
-    """What the cells of (t, x) require of both sides, the lower one first; s is 1 for the lower and −1 for the upper.
+    """The conditions of the cells of (t, x) on both sides, the lower one first; s is 1 for it and −1 for the upper one.
 
     Attributes:
       least: a lower bound of W, shape (*cells).
@@ -132,14 +132,14 @@ class TubeTask:
         return found
 
     def hulls(self) -> Sides:
-        """What is known before any cell is evaluated."""
+        """The conditions before any cell is evaluated."""
         least, most = hulls(self.values, self.mesh)
         rate, helper, hinder = (np.full((2, *self.spline.shape), np.inf) for _ in range(3))
         return Sides(least, most, rate, helper, hinder, np.zeros(self.spline.shape, bool))
 
     @quietly
     def evaluate(self, found: Sides, chosen: np.ndarray) -> None:
-        """Enter what some cells require, True in ``chosen``, (*cells)."""
+        """Enter the conditions of some cells, True in ``chosen``, (*cells)."""
         found.rate[:, chosen] = -np.inf
         found.known[chosen] = True
         for some in _parts(np.nonzero(chosen)):
@@ -194,7 +194,7 @@ class TubeTask:
         """σ at the beginning of every time slab and at the horizon, with the sign of the side; infinite if unknown.
 
         Args:
-          found: what the cells require.
+          found: the conditions of the cells.
           ranges: the ranges of the obstacles.
           level: v, with the sign of the side.
           side: 0 for the lower and 1 for the upper side.

@@ -40,6 +40,10 @@ class TubeEnclosure:
       message: the statement that is proved.
       stats: "seconds", "bytes" (the estimated memory), "cells" and "bisected", the numbers of evaluated and of bisected
         cells.
+      spline: the cells of W in (t, x).
+      coefficients: of W at the first times, which determine W at t = 0.
+      thresholds: W ≥ the first one proves V > v, or V ≥ v for ``avoid``, and −W ≥ the second one V ≤ v, or V < v.
+      above: True for ``avoid``.
     """
 
     grid: Grid
@@ -52,7 +56,7 @@ class TubeEnclosure:
     stats: dict
     spline: Spline = dataclasses.field(repr=False)
     coefficients: np.ndarray = dataclasses.field(repr=False)
-    thresholds: tuple[float, float] = dataclasses.field(repr=False)  # of s W for the lower and the upper side
+    thresholds: tuple[float, float] = dataclasses.field(repr=False)
     above: bool = dataclasses.field(repr=False)
 
     def inner_at(self, x: Numbers | Sequence) -> np.ndarray:
@@ -160,7 +164,7 @@ def enclose_tube(
 
 
 def _thresholds(task: TubeTask, levels: tuple[float, float], depth: int) -> tuple[Sides, list[np.ndarray], int]:
-    """What the cells require, σ for both sides, and the number of bisected cells."""
+    """The conditions of the cells, σ for both sides, and the number of bisected cells."""
     found, ranges = task.hulls(), task.obstacle_ranges()
     middle = (levels[0] - levels[1]) / 2
     widths = (found.most - found.least)[(found.least <= middle) & (found.most >= middle)]

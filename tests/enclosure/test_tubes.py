@@ -140,6 +140,43 @@ def test_the_tube_that_a_double_integrator_cannot_avoid_is_enclosed():
     assert np.median(along_rays(found)) < 2
 
 
+def turned(states, horizon, steps=100, switches=41):
+    """The least distance of a Dubins car from a disc under two arcs, left, straight or right: at least V."""
+    t, best = np.linspace(0.0, horizon, steps + 1)[:, None], np.full(len(states), np.inf)
+
+    def arc(x, y, angle, turn, time):
+        after = angle + turn * time
+        if turn == 0:
+            return x + time * np.cos(angle), y + time * np.sin(angle), after
+        return x + (np.sin(after) - np.sin(angle)) / turn, y - (np.cos(after) - np.cos(angle)) / turn, after
+
+    for first in (-1.0, 0.0, 1.0):
+        for second in (-1.0, 0.0, 1.0):
+            for switch in np.linspace(0.0, horizon, switches):
+                x, y, angle = arc(*states.T, first, np.minimum(t, switch))
+                x, y, _ = arc(x, y, angle, second, np.maximum(t - switch, 0.0))
+                best = np.minimum(best, (np.hypot(x, y) - 0.5).min(axis=0))
+    return best
+
+
+@pytest.mark.slow
+def test_the_tube_of_a_dubins_car_is_enclosed_within_two_cells():
+    problem = hjb.reach(lambda x, u: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), u[0]]), UNIT, disc)
+    grid = hjb.Grid([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi], (41, 41, 40), periodic=(False, False, True))
+    found = hjb.enclose_tube(problem, marched(problem, grid, 1.0, 16))
+    states = np.random.default_rng(0).uniform([-2, -2, -np.pi], [2, 2, np.pi], (2000, 3))
+    value = turned(states, 1.0)
+    assert np.all(value[found.inner_at(states)] <= 0.01)
+    assert np.all(value[~found.outer_at(states)] > 0)
+    angles, radii = np.linspace(0, 2 * np.pi, 24, endpoint=False), np.linspace(0.0, 1.99, 400)
+    rays = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    widths = []
+    for heading in np.linspace(-np.pi, np.pi, 8, endpoint=False):
+        full = np.concatenate([rays, np.full((*rays.shape[:2], 1), heading)], axis=-1)
+        widths.append((found.outer_at(full).sum(axis=0) - found.inner_at(full).sum(axis=0)) * (radii[1] - radii[0]))
+    assert np.median(widths) < 2 * float(grid.spacing(0))
+
+
 def test_the_hulls_of_the_coefficients_contain_the_spline():
     draw = np.random.default_rng(0)
     grid = hjb.Grid([0.0, 0.0], [2.0, 1.0], (7, 8), periodic=(False, True), stretch=(hjb.Sinh(2.0, 0.4), None))

@@ -48,6 +48,15 @@ def test_a_pursuit_on_a_line_is_enclosed(problem):
     assert "empty" not in found.message
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("tube", [True, False])
+def test_a_target_behind_an_obstacle_is_enclosed(tube):
+    """At unit speed |x| ≤ ½ is reached from −½ − T on, and up to the obstacle 1 ≤ x ≤ 1.5, which no path may touch."""
+    problem = hjb.reach_avoid(lambda x, u: u, UNIT, size, lambda x: jnp.abs(x[0] - 1.25) - 0.25, tube=tube)
+    found = hjb.enclose_tube(problem, marched(problem, hjb.Grid([-2.5], [2.5], (101,)), 1.0, 41))
+    assert interval(found, -1.5, 1.0) < 1.0
+
+
 def test_a_nonlinear_drift_is_enclosed_at_another_level():
     """The right end of the tube for V ≤ 0.1 recedes at the speed ½ − 0.4 sin 2x."""
     problem = hjb.reach(lambda x, u, d: 0.4 * jnp.sin(2 * x) + u + d, UNIT, size, disturbances=HALF)
@@ -163,7 +172,7 @@ def turned(states, horizon, steps=100, switches=41):
 def test_the_tube_of_a_dubins_car_is_enclosed_within_two_cells():
     problem = hjb.reach(lambda x, u: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), u[0]]), UNIT, disc)
     grid = hjb.Grid([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi], (41, 41, 40), periodic=(False, False, True))
-    found = hjb.enclose_tube(problem, marched(problem, grid, 1.0, 16))
+    found = hjb.enclose_tube(problem, marched(problem, grid, 1.0, 26))
     states = np.random.default_rng(0).uniform([-2, -2, -np.pi], [2, 2, np.pi], (2000, 3))
     value = turned(states, 1.0)
     assert np.all(value[found.inner_at(states)] <= 0.01)

@@ -171,8 +171,8 @@ def turned(states, horizon, steps=100, switches=41):
 @pytest.mark.slow
 def test_the_tube_of_a_dubins_car_is_enclosed_within_two_cells():
     problem = hjb.reach(lambda x, u: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), u[0]]), UNIT, disc)
-    grid = hjb.Grid([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi], (41, 41, 40), periodic=(False, False, True))
-    found = hjb.enclose_tube(problem, marched(problem, grid, 1.0, 26))
+    grid = hjb.Grid([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi], (49, 49, 48), periodic=(False, False, True))
+    found = hjb.enclose_tube(problem, marched(problem, grid, 1.0, 21))
     states = np.random.default_rng(0).uniform([-2, -2, -np.pi], [2, 2, np.pi], (2000, 3))
     value = turned(states, 1.0)
     assert np.all(value[found.inner_at(states)] <= 0.01)

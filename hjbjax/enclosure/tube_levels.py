@@ -38,12 +38,12 @@ TRIALS = 100  # of the rise of the level in one time slab
 MORE = 1.01  # factor by which a trial exceeds the rise that the cells so far require
 
 
-def with_time(drift: Callable, z: Array, *inputs: Array) -> Array:
+def steady_drift(drift: Callable, z: Array, *inputs: Array) -> Array:
     """The drift of (t, x) for a drift that does not depend on time."""
     return jnp.concatenate([jnp.ones(1), jnp.asarray(drift(z[1:], *inputs)).reshape(-1)])
 
 
-def with_given_time(drift: Callable, z: Array, *inputs: Array) -> Array:
+def timed_drift(drift: Callable, z: Array, *inputs: Array) -> Array:
     """The drift of (t, x) for a drift that takes the time as its first argument."""
     return jnp.concatenate([jnp.ones(1), jnp.asarray(drift(z[0], z[1:], *inputs)).reshape(-1)])
 
@@ -94,11 +94,11 @@ class TubeTask:
             [0.0, *np.asarray(grid.lo)], [horizon, *np.asarray(grid.hi)], values.shape,
             periodic=(False, *grid.periodic), stretch=(None, *grid.stretch), edges=("open", *grid.edges),
         )  # fmt: skip
-        drift = jax.tree_util.Partial(with_given_time if problem.time_dependent else with_time, problem.drift)
+        drift = jax.tree_util.Partial(timed_drift if problem.time_dependent else steady_drift, problem.drift)
         moving = Problem(
             drift, None, problem.controls, disturbances=problem.disturbances, isaacs=problem.isaacs
         )  # fmt: skip
-        return cls(problem, moving, mesh, Spline.on(mesh), coefficients(values, mesh))
+        return cls(problem, moving, mesh, Spline.on(mesh), spline_coefficients(values, mesh))
 
     def obstacles(self, z: list[Form]) -> tuple[list[tuple[Form | None, Form | None]], Form]:
         """The obstacles that help and hinder each side, ``None`` if there is none, and V at the horizon."""
@@ -270,7 +270,7 @@ def _rates(block: defect.CellBlock, w: Form, p: list[Form]) -> tuple[np.ndarray,
     return rate.hi, -rate.lo
 
 
-def coefficients(values: np.ndarray, mesh: Grid) -> np.ndarray:
+def spline_coefficients(values: np.ndarray, mesh: Grid) -> np.ndarray:
     """Coefficients of a spline near some node values: a spline with the values as coefficients is too smooth.
 
     At a kink they are the values, because a spline through them would overshoot.

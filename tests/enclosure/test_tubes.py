@@ -84,10 +84,10 @@ def test_a_tube_that_meets_the_ends_is_that_of_the_problem_with_walls():
     assert not found.inner_at([[5.0]]).any()
 
 
-def reached(states, distance, horizon, steps=400, switches=81):
-    """The least distance of a double integrator under one switch between u = 1 and −1: by the maximum principle, V."""
+def reached(states, distance, horizon, power, steps=400, switches=81):
+    """The least distance of a double integrator under one switch between ± power: by the maximum principle, V."""
     best = np.full(len(states), np.inf)
-    for sign in (-1.0, 1.0):
+    for sign in (-power, power):
         for switch in np.linspace(0.0, horizon, switches):
             t = np.linspace(0.0, horizon, steps + 1)[:, None]
             before, after = np.minimum(t, switch), np.maximum(t - switch, 0.0)
@@ -115,14 +115,20 @@ def along_rays(found, count=64, points=1500):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("target", "count", "cells"), [(disc, 41, 2.0), (disc, 81, 2.0), (square, 41, 6.0)])
-def test_the_tube_of_a_double_integrator_is_enclosed(target, count, cells):
+@pytest.mark.parametrize(
+    ("target", "count", "cells", "rivals"),
+    [(disc, 41, 2.0, False), (disc, 81, 2.0, False), (disc, 41, 2.0, True), (square, 41, 6.0, False)],
+)
+def test_the_tube_of_a_double_integrator_is_enclosed(target, count, cells, rivals):
+    """A rival with half of the power on the same axis leaves the control half of its power."""
     problem = hjb.reach(lambda x, u: jnp.stack([x[1], u[0]]), UNIT, target)
+    if rivals:
+        problem = hjb.reach(lambda x, u, d: jnp.stack([x[1], u[0] + d[0]]), UNIT, target, disturbances=HALF)
     solution = marched(problem, hjb.Grid([-2.0, -2.0], [2.0, 2.0], (count, count)), 1.0, count // 2 + 1)
     found = hjb.enclose_tube(problem, solution)
     states = np.random.default_rng(0).uniform(-2, 2, (4000, 2))
     kind = (lambda x: np.hypot(*x) - 0.5) if target is disc else (lambda x: np.abs(x).max(axis=0) - 0.5)
-    value = reached(states, kind, 1.0)
+    value = reached(states, kind, 1.0, 0.5 if rivals else 1.0)
     assert np.all(value[found.inner_at(states)] <= 0.01)  # the oracle samples times and switches
     assert np.all(value[~found.outer_at(states)] > 0)
     assert np.median(along_rays(found)) < cells

@@ -20,6 +20,7 @@ from hjbjax.decomposition.decompose import Decomposition, decompose
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
 from hjbjax.enclosure.bounds import Enclosure
 from hjbjax.enclosure.enclose import enclose
+from hjbjax.enclosure.tubes import TubeEnclosure, enclose_tube
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
 from hjbjax.feedback.feedback import greedy_feedback
@@ -97,6 +98,7 @@ __all__ = [
     "Sweeps",
     "Tableau",
     "Transition",
+    "TubeEnclosure",
     "Upwind",
     "ValueIteration",
     "Weno5",
@@ -111,6 +113,7 @@ __all__ = [
     "discount_rate",
     "dissipation",
     "enclose",
+    "enclose_tube",
     "equilibrium",
     "estimate",
     "expected_exit_time",

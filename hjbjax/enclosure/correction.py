@@ -39,22 +39,28 @@ def on_nodes(cells: np.ndarray, grid: Grid, join: Callable[..., Any] = np.mean) 
     return cells
 
 
-def solver(
-    problem: Problem, grid: Grid, policy: np.ndarray | None, rate: np.ndarray
-) -> Callable[[np.ndarray], np.ndarray]:
+def generator(problem: Problem, grid: Grid, policy: np.ndarray, t: float = 0.0) -> Any:
+    """The generator of the Markov chain under the controls of both players, a sparse matrix."""
+    count = 0 if problem.controls is None else problem.controls.dim
+    own, other = policy[..., :count], policy[..., count:]
+    disturbance = other if problem.is_game else None
+    return chain.generator(problem, grid, own if count else None, disturbance=disturbance, t=t)
+
+
+def solver(problem: Problem, grid: Grid, policy: np.ndarray, rate: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """The solution E of (β − L^π) E = s as a function of s.
 
     Args:
       problem: the problem.
       grid: the grid.
-      policy: the control at every node, shape (*grid, m); ``None`` without controls.
+      policy: the controls of both players at every node, shape (*grid, m + l).
       rate: β at every node, shape (*grid); without a discount one on the target and a small number elsewhere.
     """
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import bicgstab, splu
 
     without = altered(problem, discount=1.0) if callable(problem.discount) else problem
-    matrix = (diags_array(rate.ravel()) - chain.generator(without, grid, policy)).tocsc()
+    matrix = (diags_array(rate.ravel()) - generator(without, grid, policy)).tocsc()
     if grid.ndim <= DIRECT:
         factors = splu(matrix)
         return lambda source: factors.solve(source.ravel()).reshape(grid.shape)

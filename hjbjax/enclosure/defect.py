@@ -17,6 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hjbjax.enclosure import games
 from hjbjax.enclosure.interpolant import SEAM, Cells, Spline
 from hjbjax.enclosure.minimum import Cell, Functions, cell_defect, functions
 from hjbjax.problem.grid import Grid
@@ -24,6 +25,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.tracing import intervals as iv
 from hjbjax.tracing import taylor_forms as tf
 from hjbjax.tracing.intervals import Interval, point, quietly
+from hjbjax.tracing.taylor_forms import Form
 
 BLOCK = 8192  # cells that are evaluated together: the arrays of one operation stay in the cache
 Index = tuple[np.ndarray, ...]
@@ -70,7 +72,7 @@ def blocks(problem: Problem, grid: Grid, spline: Spline, index: Index, depth: in
     """Blocks of parts of some cells.
 
     Args:
-      problem: a problem of one player with costs.
+      problem: a problem with costs.
       grid: the grid.
       spline: its cells.
       index: the number of each cell along every axis.
@@ -100,7 +102,8 @@ def blocks(problem: Problem, grid: Grid, spline: Spline, index: Index, depth: in
             if problem.target is not None:
                 (level,) = tf.taylor_forms(problem.target, x).reshape(-1)
                 ended = np.broadcast_to(level.bounds(cells.radii).hi <= 0, cells.ranges[0].lo.shape)
-            found.append(CellBlock(block, number, cells, functions(problem, x, cells.radii), signs, ended))
+            known = (games.functions if problem.is_game else functions)(problem, x, cells.radii)
+            found.append(CellBlock(block, number, cells, known, signs, ended))
     return found
 
 
@@ -110,7 +113,7 @@ def _sides(index: Index, spline: Spline) -> list[np.ndarray]:
     return [np.where(i == 0, -1, np.where(i == cells - 1, 1, 0)) for i, cells in pairs]
 
 
-def parts_of(grid: Grid, spline: Spline, index: Index, depth: int) -> Cells:
+def parts_of(grid: Grid, spline: Spline, index: Index, depth: int, stopped: Sequence[int] = ()) -> Cells:
     """The parts of some cells inside the box, 2^depth along every axis, the parts of one cell after each other.
 
     Args:
@@ -118,8 +121,9 @@ def parts_of(grid: Grid, spline: Spline, index: Index, depth: int) -> Cells:
       spline: its cells.
       index: the number of each cell along every axis.
       depth: the number of bisections along every axis.
+      stopped: axes along which only the middle of a cell counts, which is a node.
     """
-    ends = _parts(grid, _sides(index, spline), [depth] * grid.ndim, ())
+    ends = _parts(grid, _sides(index, spline), [depth] * grid.ndim, stopped)
     return spline.cells([np.repeat(i, 2 ** (depth * grid.ndim)) for i in index], ends)
 
 
@@ -138,9 +142,9 @@ def defects(spline: Spline, known: Sequence[CellBlock], values: np.ndarray, befo
       values: the coefficients of W.
       before: the defects so far, if the blocks do not contain all cells.
     """
-    inputs = 0 if not known or known[0].known.problem.controls is None else known[0].known.problem.controls.dim
     if before is None:
-        policy = np.zeros((*spline.shape, inputs))
+        sets = [known[0].known.problem.controls, known[0].known.problem.disturbances]
+        policy = np.zeros((*spline.shape, sum(each.dim for each in sets if each is not None)))
         before = Defects(np.full(spline.shape, -np.inf), np.full(spline.shape, np.inf), policy)
     total = Defects(before.low.copy(), before.high.copy(), before.policy)
     for block in known:
@@ -188,7 +192,13 @@ def over_block(block: CellBlock, values: np.ndarray) -> tuple[Interval, np.ndarr
       block: the parts.
       values: the coefficients of W.
     """
-    w, p = block.cells.scalars(values)
+    return over_forms(block, *block.cells.scalars(values))
+
+
+def over_forms(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:
+    """The same for W and its gradient over these parts."""
+    if block.known.problem.is_game:
+        return _over_block_of_game(block, w, p)
     every = frozenset(block.walls)
     found = cell_defect(Cell(block.known, w, p), [every] if every else [])
     low, high = found.defect.ends
@@ -201,6 +211,22 @@ def over_block(block: CellBlock, values: np.ndarray) -> tuple[Interval, np.ndarr
         low = (point(low) - loss).lo
     if every:
         high = np.where(rises, np.maximum(high, found.least[every]), high)
-    # the unit is positive
-    ratios = [point(each) / found.unit for each in (np.minimum(low, high), high)]
-    return Interval(ratios[0].lo, ratios[1].hi), found.policy
+    return _per_unit(low, high, found.unit), found.policy
+
+
+def _over_block_of_game(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:
+    """The same for a game."""
+    rises, falls = {}, {}
+    for axis, side in block.walls.items():
+        slope = p[axis].bounds(block.cells.radii)
+        outward = iv.where(side > 0, slope, -slope)
+        rises[axis], falls[axis] = outward.hi > 0, outward.lo < 0
+    stopped = games.subsets(rises), games.subsets(falls)
+    found, policy = games.cell_defect(Cell(block.known, w, p), *stopped)
+    return _per_unit(*found.ends, block.known.unit), policy
+
+
+def _per_unit(low: np.ndarray, high: np.ndarray, unit: Interval) -> Interval:
+    """Both bounds divided by a positive number."""
+    ratios = [point(each) / unit for each in (np.minimum(low, high), high)]
+    return Interval(ratios[0].lo, ratios[1].hi)

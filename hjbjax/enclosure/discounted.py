@@ -41,7 +41,7 @@ class DiscountTask:
     """The data of both bounds.
 
     Attributes:
-      problem: a problem of one player with costs.
+      problem: a problem with costs.
       grid: the grid.
       spline: the cells of the grid.
       known: the functions of the problem over all cells.
@@ -68,9 +68,8 @@ class DiscountTask:
 
     def solver(self, found: Defects, rates: np.ndarray) -> Move:
         """The solution E of (β − L^π) E = s as a function of s, where π is the control that is optimal for W."""
-        policy = np.stack(
-            [correction.on_nodes(found.policy[..., j], self.grid) for j in range(found.policy.shape[-1])], axis=-1
-        ) if found.policy.shape[-1] else None  # fmt: skip
+        inputs = [correction.on_nodes(found.policy[..., j], self.grid) for j in range(found.policy.shape[-1])]
+        policy = np.stack(inputs, axis=-1) if inputs else np.zeros((*self.grid.shape, 0))
         return correction.solver(self.problem, self.grid, policy, rates)
 
     def remaining(self, upper: Bound) -> np.ndarray:

@@ -52,9 +52,9 @@ def enclose(
     The bounds are those of the problem with the ends of its grid: projected ends are walls that stop outward motion.
 
     Args:
-      problem: one player, either a discount or a target, no noise, jumps, modes or obstacles. Drift, costs and discount
-        must be Lipschitz functions of the state that are defined on the whole box. On a periodic axis they must be
-        periodic.
+      problem: one player or a game, either a discount or a target, no noise, jumps, modes or obstacles. In a game drift
+        and cost must be quadratic polynomials of the inputs, or the sets finite. Drift, costs and discount must be
+        Lipschitz functions of the state that are defined on the whole box. On a periodic axis they must be periodic.
       solution: a solution of this problem by ``solve``. The bounds hold for any solution; they are narrow for a good
         one.
 
@@ -129,7 +129,7 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
         raise ValueError("enclose: got traced numbers; call it outside of jit, vmap and grad")
     grid, costs = solution.grid, in_costs(solution)
     lacking = {
-        "a game": problem.is_game, "random paths (noise, jumps or modes)": is_random(problem),
+        "random paths (noise, jumps or modes)": is_random(problem),
         "modes": problem.modes is not None, "pushes": bool(problem.pushes), "growth": problem.growth is not None,
         "a target with a discount": problem.target is not None and bool(is_discounted(problem)),
         "time_dependent=True": problem.time_dependent,
@@ -140,8 +140,8 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
     }  # fmt: skip
     if found := [name for name, there in lacking.items() if there]:
         raise ValueError(
-            f"enclose: got {' and '.join(found)}; wanted a stationary problem of one player whose paths are not\n"
-            "random, with a discount or with a target. Bounds on the true value are proved only for these problems;\n"
+            f"enclose: got {' and '.join(found)}; wanted a stationary problem whose paths are not random,\n"
+            "with a discount or with a target. Bounds on the true value are proved only for these problems;\n"
             "Solution.grid_error and box_error are estimates for the others"
         )
     kinds = sorted({kind for pair in grid.edges if pair for kind in pair if kind != "projected"})
@@ -189,13 +189,17 @@ def _peak_bytes(problem: Problem, grid: Grid) -> int:
     These are the weights of the spline, the functions of the problem and the factors of the chain.
     """
     n, m = grid.ndim, 0 if problem.controls is None else problem.controls.dim
-    arguments = ([0.0] * n, [0.0] * m)
+    arguments: list[list[float]] = [[0.0] * n, [0.0] * m]
+    if problem.disturbances is not None:
+        arguments.append([0.0] * problem.disturbances.dim)
     counts = [operations(traced(each, *arguments)) for each in (problem.drift, problem.cost) if each is not None]
     scalars = 60 + sum(each.single + each.whole for each in counts)
     # range, centre, slopes, gradient and second derivatives, each with two bounds
     scalar = 8 * 2 * (2 + 2 * n + n * (n + 1) // 2)
     block = scalar * min(grid.size, defect.BLOCK) * scalars
-    terms = len(problem.controls.points) if isinstance(problem.controls, Finite) else m + 1
+    terms = 1
+    for each in (problem.controls, problem.disturbances):
+        terms *= len(each.points) if isinstance(each, Finite) else 1 + (0 if each is None else each.dim)
     known = scalar * (2 + (n + 1) * terms) + 8 * 27 * n
     if problem.target is not None:  # the parts of the cells along a boundary as large as that of the box
         known *= 1 + 2 ** (exits.DEPTH * n) * 2 * n / min(grid.shape)

@@ -37,7 +37,8 @@ class Functions:
       x: the state.
       radii: the largest distance from the centre along every axis.
       rate: the discount.
-      unit: the positive number by which a defect is divided: the discount, or without one a lower bound of the cost.
+      unit: the positive number by which a defect is divided: the discount, or without one a lower bound of the cost,
+        or one in a tube.
       options: cost and drift as polynomials of the control, or for every action of a finite set; empty if they are not
         quadratic polynomials.
     """
@@ -92,11 +93,7 @@ def functions(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> Funct
       x: the state.
       radii: the largest distance from the centre along every axis.
     """
-    (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
-    unit = rate.range
-    if not is_discounted(problem):  # an interval that contains zero makes the defect infinite
-        least = _running_cost(problem, x, any_action(problem.controls)).bounds(radii).lo
-        unit = point(np.maximum(least, 0.0))
+    rate, unit = rate_and_unit(problem, x, radii)
     options: list[tuple[qu.Polynomial, list[qu.Polynomial]]] = []
     if isinstance(problem.controls, Finite):
         for u in np.asarray(problem.controls.points, float):
@@ -112,6 +109,17 @@ def functions(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> Funct
             cost = qu.quadratics(problem.cost, x, count)[0]
         options.append((cost, qu.quadratics(problem.drift, x, count)))
     return Functions(problem, x, radii, rate, unit, options)
+
+
+def rate_and_unit(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> tuple[Form, Interval]:
+    """The discount, and the number by which a defect is divided, see ``Functions``."""
+    (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
+    if is_discounted(problem):  # an interval that contains zero makes the defect infinite
+        return rate, rate.range
+    if problem.target is None:  # a tube, where only the sign of the defect counts
+        return rate, point(1.0)
+    least = _running_cost(problem, x, *any_actions(problem)).bounds(radii).lo
+    return rate, point(np.maximum(least, 0.0))
 
 
 def cell_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
@@ -341,6 +349,11 @@ def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
     )
 
 
+def any_actions(problem: Problem) -> list[list[Form]]:
+    """Every input of each player as one interval."""
+    return [any_action(each) for each in (problem.controls, problem.disturbances)[: 1 + problem.is_game]]
+
+
 def any_action(admissible: Any) -> list[Form]:
     """Every input of the control as one interval."""
     if admissible is None:
@@ -349,8 +362,8 @@ def any_action(admissible: Any) -> list[Form]:
     return [Form(each, each) for each in inputs]
 
 
-def _running_cost(problem: Problem, x: list[Form], u: list[Form]) -> Form:
-    return tf.constant(0.0) if problem.cost is None else tf.taylor_forms(problem.cost, x, u).item()
+def _running_cost(problem: Problem, x: list[Form], *inputs: list[Form]) -> Form:
+    return tf.constant(0.0) if problem.cost is None else tf.taylor_forms(problem.cost, x, *inputs).item()
 
 
 def _hamiltonian(paid: Form, drift: Sequence[Form], p: Sequence[Form], without: frozenset[int]) -> Form:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hjbjax.enclosure.defect import all_cells
 from hjbjax.enclosure.interpolant import Spline
-from hjbjax.enclosure.minimum import any_action
+from hjbjax.enclosure.minimum import any_actions
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing import taylor_forms as tf
@@ -24,7 +24,7 @@ def times(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
     """A lower bound of the time until any path from each node meets a projected end, shape (*grid).
 
     Args:
-      problem: a problem of one player with costs.
+      problem: a problem with costs.
       grid: the grid.
       spline: the cells.
 
@@ -37,7 +37,7 @@ def times(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
     every = all_cells(spline)
     cells = spline.cells(every)
     x = tf.coordinates(cells.ranges, cells.centres, grid.ndim)
-    drift = tf.taylor_forms(problem.drift, x, any_action(problem.controls))
+    drift = tf.taylor_forms(problem.drift, x, *any_actions(problem))
     soonest = np.full(grid.shape, np.inf)
     for axis, step in ends:
         outward = drift[axis].range.hi if step > 0 else -drift[axis].range.lo
@@ -55,7 +55,7 @@ def remaining(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
     """The largest discount factor at the time when a path from each node meets a projected end, shape (*grid).
 
     Args:
-      problem: a problem of one player with costs and a discount.
+      problem: a problem with costs and a discount.
       grid: the grid.
       spline: the cells.
 

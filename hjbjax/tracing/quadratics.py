@@ -54,22 +54,29 @@ class Polynomial(dict[tuple[int, ...], Form]):
 
 
 @quietly
-def quadratics(function: Callable, x: Sequence[Form], count: int) -> list[Polynomial]:
-    """The entries of a function of (x, u) as polynomials of u.
+def quadratics(function: Callable, x: Sequence[Form], *inputs: int | np.ndarray) -> list[Polynomial]:
+    """The entries of a function of (x, u), or of (x, u, d), as polynomials of the inputs.
 
     Args:
       function: a JAX-traceable function.
       x: the state over boxes.
-      count: the number of inputs of the control.
+      *inputs: for every player the number of its inputs, which are numbered through, or the numbers of its control.
 
     Raises:
       NotQuadraticError: the function is not a quadratic polynomial of u.
       ValueError: it uses a primitive without a rule.
     """
-    closed = tf.traced(function, list(x), [0.0] * count)
-    states = object_array([Polynomial({(): each}) for each in x], (len(x),))
-    inputs = object_array([Polynomial({(j,): tf.constant(1.0)}) for j in range(count)], (count,))
-    (result,) = evaluate_jaxpr(closed, [states, inputs], _POLYNOMIALS)
+    counts = [each if isinstance(each, int) else len(each) for each in inputs]
+    closed = tf.traced(function, list(x), *([0.0] * count for count in counts))
+    arguments, first = [object_array([Polynomial({(): each}) for each in x], (len(x),))], 0
+    for each, count in zip(inputs, counts, strict=True):
+        if isinstance(each, int):
+            own = [Polynomial({(first + j,): tf.constant(1.0)}) for j in range(count)]
+            first += count
+        else:
+            own = [Polynomial({(): tf.constant(number)}) for number in each]
+        arguments.append(object_array(own, (count,)))
+    (result,) = evaluate_jaxpr(closed, arguments, _POLYNOMIALS)
     return list(np.ravel(lift(result, _POLYNOMIALS)))
 
 

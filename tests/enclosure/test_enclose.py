@@ -242,7 +242,7 @@ def test_of_several_candidates_only_the_best_one_in_a_cell_must_be_a_bound():
         needs = branches.required(task, sides, found, -1)
         alone = [float(np.max(-each.low)) for each in found]
     assert min(alone) > 0.3
-    assert np.max(needs) < 1e-2
+    assert np.max(needs) < 0.025  # next to ±1, where the cost has a kink
 
 
 @pytest.mark.slow

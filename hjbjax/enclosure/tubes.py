@@ -1,0 +1,292 @@
+"""``enclose_tube``: an inner and an outer set of a marched tube, with proof."""
+
+import dataclasses
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from hjbjax.enclosure.interpolant import Spline
+from hjbjax.enclosure.tube_levels import Sides, TubeTask
+from hjbjax.problem import arguments
+from hjbjax.problem.grid import Grid
+from hjbjax.problem.problem import Problem, is_discounted, is_random
+from hjbjax.problem.pytree import front_door, is_traced
+from hjbjax.problem.settings import own_settings
+from hjbjax.problem.state_bounds import in_unit_box
+from hjbjax.problem.types import Numbers
+from hjbjax.solution.solution import Solution
+from hjbjax.solvers import memory
+from hjbjax.tracing import closures
+from hjbjax.tracing.operations import operations
+from hjbjax.tracing.taylor_forms import traced
+
+FEWEST = 3  # times, for a parabola
+WIDER = 4  # times that the band of evaluated cells is doubled before a side is given up
+WORTH = 0.3  # a cell is bisected if its rate exceeds this fraction of the mean rate of the level
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TubeEnclosure:
+    """Two sets at t = 0, one inside and one outside a tube; made by ``enclose_tube``.
+
+    Args:
+      grid: the grid.
+      level: v; the tube is {V ≤ v}, or {V ≥ v} for ``avoid``.
+      inner: a function at the nodes, shape (*grid), that is ≤ 0 in the inner set; NaN if the inner set is empty.
+      outer: a function at the nodes that is ≤ 0 in the outer set; NaN if the outer set is the whole box.
+      shifts: the numbers by which the levels of W of the outer and the inner set differ from v, in units of V.
+      is_free: True if the sets are also those of the problem that continues beyond the box.
+      message: the statement that is proved.
+      stats: "seconds", "bytes" (the estimated memory), "cells" and "bisected", the numbers of evaluated and of bisected
+        cells.
+      spline: the cells of W in (t, x).
+      coefficients: of W at the first times, which determine W at t = 0.
+      thresholds: W ≥ the first one proves V > v, or V ≥ v for ``avoid``, and −W ≥ the second one V ≤ v, or V < v.
+      above: True for ``avoid``.
+    """
+
+    grid: Grid
+    level: float
+    inner: np.ndarray
+    outer: np.ndarray
+    shifts: tuple[float, float]
+    is_free: bool
+    message: str
+    stats: dict
+    spline: Spline = dataclasses.field(repr=False)
+    coefficients: np.ndarray = dataclasses.field(repr=False)
+    thresholds: tuple[float, float] = dataclasses.field(repr=False)
+    above: bool = dataclasses.field(repr=False)
+
+    def inner_at(self, x: Numbers | Sequence) -> np.ndarray:
+        """True at states that are proved to be in the tube.
+
+        Args:
+          x: states inside the box, shape (n,) or (..., n).
+
+        Returns:
+          Booleans, shape (...). False outside the box.
+        """
+        return self._beyond(x, 0 if self.above else 1, False)
+
+    def outer_at(self, x: Numbers | Sequence) -> np.ndarray:
+        """False at states that are proved not to be in the tube; True outside the box."""
+        return ~self._beyond(x, 1 if self.above else 0, False)
+
+    def _beyond(self, x: Numbers | Sequence, side: int, otherwise: bool) -> np.ndarray:
+        """True where W is beyond the threshold of a side."""
+        states, n = np.asarray(x, float), self.grid.ndim
+        if states.ndim == 0 or states.shape[-1] != n:
+            raise ValueError(f"TubeEnclosure: got states of shape {states.shape}, wanted (..., {n})")
+        flat = states.reshape(-1, n)
+        lo, hi = np.asarray(self.grid.lo, float), np.asarray(self.grid.hi, float)
+        cyclic = np.array(self.grid.periodic)
+        flat = np.where(cyclic & ((flat < lo) | (flat > hi)), lo + np.mod(flat - lo, hi - lo), flat)
+        inside = np.all((flat >= lo) & (flat <= hi), axis=-1)
+        found = np.full(len(flat), otherwise)
+        if np.any(inside):
+            own = flat[inside]
+            w = self.spline.at(np.column_stack([np.zeros(len(own)), own])).values(self.coefficients)
+            found[inside] = (w.lo if side == 0 else -w.hi) >= self.thresholds[side]
+        return found.reshape(states.shape[:-1])
+
+    def __repr__(self) -> str:
+        return f"TubeEnclosure(level {self.level:g}, shifts {self.shifts[0]:.3g} and {self.shifts[1]:.3g})"
+
+
+@front_door
+def enclose_tube(
+    problem: Problem, solution: Solution, *, level: float = 0.0, depth: int = 1, max_memory: int | None = None
+) -> TubeEnclosure:
+    """An inner and an outer set of a tube, with proof: neither the grid nor rounding is neglected.
+
+    A spline W in time and space has the defect −W_t − H(x, DW). Let σ(t) be a level of W that changes at the rate of
+    the largest defect of the cells that it meets. Then {W(0) ≥ σ(0)} belongs to {V ≥ v}, where v is σ at the horizon up
+    to the errors of W there and at the obstacles. The same holds from the other side.
+
+    Args:
+      problem: a problem of ``reach``, ``avoid`` or ``reach_avoid``, or another one without running cost, discount,
+        noise, jumps and modes. Drift and distances must be Lipschitz functions that are defined on the whole box. In a
+        game the drift must be a quadratic polynomial of the inputs, or the sets finite.
+      solution: a solution of this problem by ``march`` with equally spaced ``times`` from zero to the horizon. The sets
+        are proved for any solution; they are close to each other for a good one. A time step of one cell divided by the
+        largest speed is short enough.
+
+    Keyword Args:
+      level: v, in units of V.
+      depth: the number of times that cells with a large defect are bisected along every axis.
+      max_memory: the number of bytes that count as free.
+
+    Returns:
+      A TubeEnclosure.
+
+    Raises:
+      ValueError: the problem has an ingredient for which there is no proof, or a function without an interval rule.
+      MemoryError: the estimated memory is not free.
+
+    Example:
+      >>> import hjbjax as hjb
+      >>> import jax.numpy as jnp
+      >>> problem = hjb.reach(lambda x, u: u, hjb.Box([-1.0], [1.0]), lambda x: jnp.abs(x[0]) - 0.5)
+      >>> solution = hjb.march(problem, hjb.Grid([-3.0], [3.0], (61,)), 1.0, times=np.linspace(0, 1, 11))
+      >>> found = hjb.enclose_tube(problem, solution)
+      >>> found.inner_at([[1.4], [1.6]]).tolist(), found.outer_at([[1.4], [1.6]]).tolist()
+      ([True, False], [True, False])
+    """
+    start = time.perf_counter()
+    own, values, horizon = _checked(problem, solution)
+    if isinstance(depth, bool) or not isinstance(depth, (int, np.integer)) or depth < 0:
+        raise ValueError(f"enclose_tube: depth: got {depth!r}, wanted an integer that is not negative")
+    level = float(level)
+    grid = solution.grid
+    needed = memory.fitting(_peak_bytes(own, values.shape), grid, max_memory)
+    above = problem.inside == "above"
+    with own_settings(x64=True):
+        task = TubeTask.of(own, grid, horizon, values)
+        levels = (level if above else np.nextafter(level, np.inf), -(np.nextafter(level, -np.inf) if above else level))
+        found, paths, bisected = _thresholds(task, levels, depth)
+    low, high = (float(each[0]) for each in paths)
+    nodes = grid.nodes().reshape(-1, grid.ndim)
+    w = task.spline.at(np.column_stack([np.zeros(len(nodes)), nodes])).values(task.values)
+    below, over = (np.where(np.isfinite(end), each - end, np.nan) for each, end in ((w.hi, low), (w.lo, -high)))
+    first, second = (-over, -below) if above else (below, over)  # outer and inner
+    is_free = _is_free(task, found, -high if above else low, above)
+    stats = {
+        "seconds": time.perf_counter() - start, "bytes": needed, "cells": int(found.known.sum()), "bisected": bisected,
+    }  # fmt: skip
+    shifts = (low - level, high + level)
+    return TubeEnclosure(
+        grid, level, second.reshape(grid.shape), first.reshape(grid.shape), shifts[::-1] if above else shifts, is_free,
+        _message(low, high, above, is_free, bool(grid.sides("projected"))), stats, task.spline, task.values[:FEWEST],
+        (low, high), above,
+    )  # fmt: skip
+
+
+def _thresholds(task: TubeTask, levels: tuple[float, float], depth: int) -> tuple[Sides, list[np.ndarray], int]:
+    """The conditions of the cells, σ for both sides, and the number of bisected cells."""
+    found, ranges = task.hulls(), task.obstacle_ranges()
+    middle = (levels[0] - levels[1]) / 2
+    widths = (found.most - found.least)[(found.least <= middle) & (found.most >= middle)]
+    band = float(np.median(widths)) / 4 if widths.size else 0.0
+    cuts, wider, bisected = np.zeros(found.known.shape, int), 0, 0
+    while True:
+        near = (found.least <= middle + band) & (found.most >= middle - band)
+        task.evaluate(found, near & ~found.known)
+        paths = [task.threshold(found, ranges, level, side) for side, level in enumerate(levels)]
+        worst = [_worst(task, found, ranges, path, levels[side], side) for side, path in enumerate(paths)]
+        chosen = np.logical_or(*worst) & (cuts < depth)
+        for cut in np.unique(cuts[chosen]):
+            task.refine(found, chosen & (cuts == cut), int(cut) + 1)
+        cuts[chosen] += 1
+        bisected += int(chosen.sum())
+        if np.any(chosen):
+            continue
+        if wider == WIDER or all(np.isfinite(path[0]) for path in paths):
+            return found, paths, bisected
+        wider, band = wider + 1, 2 * band
+
+
+def _worst(
+    task: TubeTask, found: Sides, ranges: tuple[np.ndarray, np.ndarray], path: np.ndarray, level: float, side: int
+) -> np.ndarray:
+    """True for evaluated cells that the level may meet and whose rate is large, (*cells)."""
+    if not np.isfinite(path[-1]):
+        return np.zeros(found.known.shape, bool)
+    first = int(np.argmax(np.isfinite(path)))
+    path = np.where(np.isfinite(path), path, path[first])  # the level that was reached before it left the band
+    mean = float(path[0] - path[-1]) / float(task.mesh.hi[0]) * len(path) / (len(path) - first)
+    fill = (slice(None), *(None,) * (found.known.ndim - 1))
+    least, most = (found.least, found.most) if side == 0 else (-found.most, -found.least)
+    meets = found.known & (least <= path[:-1][fill]) & (most >= min(level, path[-1]))
+    meets &= ~((ranges[0][side] >= level) | (found.helper[side] <= path[1:][fill] - level))
+    return meets & (found.rate[side] > WORTH * mean)
+
+
+def _is_free(task: TubeTask, found: Sides, sigma: float, above: bool) -> bool:
+    """True if the larger set does not meet a projected end at any time.
+
+    Args:
+      task: the data.
+      found: the ranges of W.
+      sigma: the level of W at t = 0 that bounds this set; its set is the largest at t = 0.
+      above: True for the set above the level.
+    """
+    if not np.isfinite(sigma):
+        return False
+    for axis, step in task.mesh.sides("projected"):
+        ends = np.take(found.most if above else found.least, 0 if step < 0 else -1, axis=axis)
+        if not (np.all(ends < sigma) if above else np.all(ends > sigma)):
+            return False
+    return True
+
+
+def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray, float]:
+    """The problem with its numbers settled, the value at all times, and the horizon.
+
+    Raises:
+      ValueError: there is no proof for the problem, its grid or its solution.
+    """
+    for given, kind in ((problem, Problem), (solution, Solution)):
+        if not isinstance(given, kind):
+            raise TypeError(f"enclose_tube: got {type(given).__name__}, wanted a {kind.__name__}")
+    if is_traced(problem, solution.value):
+        raise ValueError("enclose_tube: got traced numbers; call it outside of jit, vmap and grad")
+    grid = solution.grid
+    lacking = {
+        "a running cost": problem.cost is not None or problem.reward is not None,
+        "a discount": bool(is_discounted(problem)), "random paths (noise, jumps or modes)": is_random(problem),
+        "modes": problem.modes is not None, "pushes": bool(problem.pushes), "growth": problem.growth is not None,
+        "a target": problem.target is not None,
+        "rewards": problem.stopping_reward is not None or problem.terminal_reward is not None,
+        "a march from other values than the terminal cost": bool(solution.stats.get("start")),
+    }  # fmt: skip
+    if found := [name for name, there in lacking.items() if there]:
+        raise ValueError(
+            f"enclose_tube: got {' and '.join(found)}; wanted a problem of reach, avoid or reach_avoid.\n"
+            "Sets are proved only for these problems"
+        )
+    kinds = sorted({kind for pair in grid.edges if pair for kind in pair if kind != "projected"})
+    if kinds:
+        raise ValueError(f"enclose_tube: got {' and '.join(kinds)} ends; wanted projected ends or periodic axes")
+    horizon = float(solution.stats.get("horizon", np.nan)) if solution.times is not None else np.nan
+    times = np.asarray([] if solution.times is None else solution.times, float)
+    even = len(times) >= FEWEST and np.allclose(
+        times, np.linspace(0.0, horizon, len(times)), rtol=0, atol=1e-9 * horizon
+    )
+    if not even:
+        raise ValueError(
+            f"enclose_tube: got a solution with {len(times)} times; wanted at least {FEWEST} equally spaced ones from\n"
+            "zero to the horizon, as in march(problem, grid, T, times=np.linspace(0, T, 41))"
+        )
+    value = np.asarray(solution.value, float)
+    if value.shape != (len(times), *grid.shape) or not np.all(np.isfinite(value)):
+        raise ValueError(f"enclose_tube: got a value of shape {value.shape}, or numbers that are not finite")
+    arguments.positive(horizon, "enclose_tube: horizon")
+    return in_unit_box(closures.settled(problem, grid.ndim), grid.ndim), value, horizon
+
+
+def _peak_bytes(problem: Problem, shape: tuple[int, ...]) -> int:
+    """Bytes that ``enclose_tube`` uses at its peak: all scalars of one block of cells, and arrays at all cells."""
+    n, size = len(shape), int(np.prod(shape))
+    sets = [problem.controls] + [problem.disturbances] * problem.is_game
+    inputs = [[0.0] * (0 if each is None else each.dim) for each in sets]
+    at = [0.0, [0.0] * (n - 1)] if problem.time_dependent else [[0.0] * (n - 1)]
+    count = operations(traced(problem.drift, *at, *inputs))
+    scalar = 8 * 2 * (2 + 2 * n + n * (n + 1) // 2)
+    return int(scalar * min(size, 8192) * (120 + count.single + count.whole) + 8 * 24 * size)
+
+
+def _message(low: float, high: float, above: bool, is_free: bool, walls: bool) -> str:
+    """The statement that is proved."""
+    which = "the problem with walls at the projected ends of the box" if walls and not is_free else "the problem"
+    text = f"The inner set is inside the tube of {which}, and the outer set contains it"
+    outer, inner = (high, low) if above else (low, high)
+    if not np.isfinite(inner):
+        text += "; the inner set is empty"
+    if not np.isfinite(outer):
+        text += "; the outer set is the whole box"
+    return text + "."
+
+
+__all__ = ["TubeEnclosure", "enclose_tube"]

@@ -39,7 +39,8 @@ def bound(
     shifts = [-sign * float(each.values[0]) for each in narrow.levels]
     kept = list(zip(narrow.coefficients, shifts, strict=True))
     smooth = correction.mollified(values, task.grid)
-    for candidates in ([smooth], one_sided(smooth, task.grid, sign)):
+    smoother = correction.mollified(correction.mollified(smooth, task.grid), task.grid)
+    for candidates in ([smoother], one_sided(smooth, task.grid, sign)):
         distance = np.max((sign * values - _best(kept, sign))[task.chosen])
         if distance <= FAR * np.ptp(values[task.chosen]):
             break

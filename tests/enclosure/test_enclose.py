@@ -251,7 +251,11 @@ def test_a_pendulum_with_swings_is_enclosed():
     """V has kinks along spirals. Both bounds were several ranges of V away from it."""
     problem, fine = hjb.zoo.pendulum(discount=0.5, shape=(800, 801))
     reference = hjb.solve(problem, fine)
-    found = hjb.enclose(problem, hjb.solve(problem, hjb.zoo.pendulum(shape=(200, 201))[1]))
+    solution = hjb.solve(problem, hjb.zoo.pendulum(shape=(200, 201))[1])
+    found = hjb.enclose(problem, solution)
+    for state in ([np.pi / 4, 0.0], [0.5, -1.0], [1.0, 1.0]):
+        extremal = hjb.pontryagin(problem, state, guess=solution)
+        assert found.lower_at(state) <= extremal.cost <= found.upper_at(state)
     nodes = fine.nodes().reshape(-1, 2)
     low, high = found.lower_at(nodes), found.upper_at(nodes)
     value, error = np.asarray(reference.value).ravel(), np.asarray(reference.grid_error).ravel()

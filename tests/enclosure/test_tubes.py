@@ -1,12 +1,14 @@
 """The inner set is in the tube and the outer set contains it, by exact answers and by oracles in plain NumPy."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hjbjax as hjb
 from hjbjax.enclosure.interpolant import Spline
-from hjbjax.enclosure.tube_levels import hulls
+from hjbjax.enclosure.tube_levels import hulls, spline_coefficients
 
 UNIT, HALF = hjb.Box([-1.0], [1.0]), hjb.Box([-0.5], [0.5])
 
@@ -199,6 +201,34 @@ def test_the_hulls_of_the_coefficients_contain_the_spline():
     least, most = hulls(values, grid)
     assert np.all(most >= spline.largest(values) - 1e-11)
     assert np.all(least <= 1e-11 - spline.largest(-values))
+
+
+def test_the_hulls_contain_the_spline_at_corners():
+    """There the coefficients continue along several axes."""
+    draw = np.random.default_rng(0)
+    for shape in ((5, 8), (4, 5, 5)):
+        zero = np.zeros(len(shape))
+        grid = hjb.Grid(zero, zero + 1, shape)
+        for _ in range(10):
+            values, spline = draw.integers(-3, 4, shape).astype(float), Spline.on(grid)
+            least, most = hulls(values, grid)
+            states = np.round(8 * draw.uniform(size=(3000, len(shape)))) / 8
+            index, found = spline.index(states), spline.at(states).values(values)
+            assert np.all(least[index] <= found.hi)
+            assert np.all(found.lo <= most[index])
+
+
+def test_wrong_values_next_to_a_wall_do_not_exclude_its_states():
+    """W is large at the lower end at t = 0 only, where the target is, because the value next to it is small."""
+    problem = hjb.reach(lambda x, u: u, hjb.Box([-0.1], [0.1]), lambda x: x[0] + 0.5)
+    solution = marched(problem, hjb.Grid([-1.0], [1.0], (9,)), 1.0, 6)
+    coefficients = np.repeat(20 * np.linspace(-1, 0, 6)[:, None], 9, axis=1)
+    coefficients[0, 1] -= 200
+    values, mesh = coefficients, hjb.Grid([0.0, -1.0], [1.0, 1.0], (6, 9), edges=("open", "projected"))
+    for _ in range(60):  # the values with these coefficients
+        values = values + (coefficients - spline_coefficients(values, mesh))
+    found = hjb.enclose_tube(problem, dataclasses.replace(solution, value=values))
+    assert np.all(found.outer_at(np.linspace(-1, -0.41, 60)[:, None]))
 
 
 def test_tubes_without_a_proof_are_refused():

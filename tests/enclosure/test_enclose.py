@@ -313,3 +313,15 @@ def test_what_is_not_proved_is_refused():
         hjb.enclose(looked_up, solution)
     with pytest.raises(ValueError, match="infinite"):
         hjb.enclose(hjb.Problem(lambda x, u: u / x, base["cost"], base["controls"], discount=1.0), solution)
+
+
+def test_values_whose_sums_may_overflow_are_refused():
+    """A lower value by 1e307 at one node gave an upper bound of −1e307 elsewhere."""
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: jnp.abs(x[0]), hjb.Box([-1.0], [1.0]), discount=1.0)
+    grid = hjb.Grid([-1.0], [1.0], (40,))
+    values = np.where(np.arange(40) == 3, -1e307, np.abs(np.asarray(grid.axis(0), float)))
+    with pytest.raises(ValueError, match="above 1e"):
+        hjb.enclose(problem, hjb.Solution(grid, values, None, code=hjb.Status.CONVERGED))
+    spline = Spline.on(grid)
+    assert np.all(np.isinf(spline.largest(values)))
+    assert np.all(np.isinf(spline.at(np.zeros((1, 1))).values(values).lo))

@@ -231,6 +231,17 @@ def test_wrong_values_next_to_a_wall_do_not_exclude_its_states():
     assert np.all(found.outer_at(np.linspace(-1, -0.41, 60)[:, None]))
 
 
+@pytest.mark.parametrize(("where", "number"), [((-1, slice(None)), 1e307), ((0, 0), -1.7e308), ((-1, 3), -1.7e308)])
+def test_values_whose_sums_may_overflow_are_refused(where, number):
+    """They gave wrong inner and outer sets."""
+    problem = hjb.reach(lambda x, u: u, UNIT, size)
+    solution = marched(problem, hjb.Grid([-1.0], [1.0], (9,)), 0.5, 6)
+    values = np.array(solution.value, float)
+    values[where] = number
+    with pytest.raises(ValueError, match="not below 1e"):
+        hjb.enclose_tube(problem, dataclasses.replace(solution, value=values))
+
+
 def test_tubes_without_a_proof_are_refused():
     grid, problem = hjb.Grid([-2.0], [2.0], (41,)), hjb.reach(lambda x, u: u, UNIT, size)
     solution = marched(problem, grid, 1.0, 5)
@@ -244,6 +255,8 @@ def test_tubes_without_a_proof_are_refused():
         hjb.enclose_tube(problem, solution, max_memory=1000)
     with pytest.raises(ValueError, match="depth"):
         hjb.enclose_tube(problem, solution, depth=-1)
+    with pytest.raises(ValueError, match="level"):
+        hjb.enclose_tube(problem, solution, level=np.nan)
     ends = marched(problem, hjb.Grid([-2.0], [2.0], (41,), edges="open"), 1.0, 5)
     with pytest.raises(ValueError, match="open ends"):
         hjb.enclose_tube(problem, ends)

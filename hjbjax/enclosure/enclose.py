@@ -155,8 +155,8 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
         value = correction.nearest_known(value, np.isfinite(value), grid)  # infinite where no path meets the target
     if value.shape != grid.shape or not np.all(np.abs(value) <= LARGEST):
         raise ValueError(
-            f"enclose: got a value of shape {value.shape}, wanted {grid.shape}, or with numbers that are not finite or\n"
-            f"above {LARGEST:g}"
+            f"enclose: got a value of shape {value.shape}; wanted {grid.shape}, without numbers that are not finite\n"
+            f"or above {LARGEST:g}"
         )
     known = in_unit_box(closures.settled(costs_of(problem), grid.ndim), grid.ndim)
     return known, value, grid

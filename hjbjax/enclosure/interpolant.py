@@ -263,11 +263,13 @@ class Spline:
     @classmethod
     def on(cls, grid: Grid) -> "Spline":
         """The cells of the nodes of a grid."""
-        axes = [np.asarray(grid.axis(axis), float) for axis in range(grid.ndim)]
-        ends = [[float(end)] if cyclic else [] for end, cyclic in zip(grid.hi, grid.periodic, strict=True)]
-        return cls(tuple(
-            axis_table(np.append(at, end), cyclic) for at, end, cyclic in zip(axes, ends, grid.periodic, strict=True)
-        ))  # fmt: skip
+        tables = []
+        for axis, cyclic in enumerate(grid.periodic):
+            at, lo, hi = np.array(grid.axis(axis), float), float(grid.lo[axis]), float(grid.hi[axis])
+            at = np.append(at, hi) if cyclic else at
+            at[0], at[-1] = lo, hi  # nodes are rounded, and the cells must cover the whole box
+            tables.append(axis_table(at, cyclic))
+        return cls(tuple(tables))
 
     @property
     def shape(self) -> tuple[int, ...]:

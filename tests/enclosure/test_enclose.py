@@ -325,3 +325,13 @@ def test_values_whose_sums_may_overflow_are_refused():
     spline = Spline.on(grid)
     assert np.all(np.isinf(spline.largest(values)))
     assert np.all(np.isinf(spline.at(np.zeros((1, 1))).values(values).lo))
+
+
+def test_the_cells_cover_the_box():
+    """The formula of the nodes rounds: on one of ten axes an end node is not the end of the box."""
+    draw = np.random.default_rng(0)
+    for _ in range(40):
+        lo, hi = np.sort(draw.uniform(-3, 3, 2))
+        for cyclic in (False, True):
+            (table,) = Spline.on(hjb.Grid([lo], [hi], (int(draw.integers(3, 90)),), periodic=(cyclic,))).tables
+            assert (table.at[0], table.at[-1]) == (lo, hi)

@@ -6,7 +6,7 @@ function is about the extrapolation 2 V(x − s) − V(x − 2s), if s is longer
 the kink off. The extrapolations along both directions of every axis are candidates. In a cell only those have to be
 bounds that are the best somewhere in it.
 
-Each candidate is corrected along the paths of its own control, since they leave the kink to one side.
+Each candidate is corrected along the paths of its control, since they leave the kink to one side.
 """
 
 from collections.abc import Sequence
@@ -34,12 +34,13 @@ REFRESHED = 4  # corrections with the same factors of their equations
 def bound(
     task: DiscountTask, values: np.ndarray, found: Defects, move: Move, sign: int, rounds: int
 ) -> tuple[Bound, np.ndarray]:
-    """As ``DiscountTask.bound``, with one-sided candidates if the bound is far from V."""
+    """The bound of ``DiscountTask.bound``, with more candidates if it is far from V."""
     narrow, sizes = task.bound(values, found, move, sign, rounds)
     shifts = [-sign * float(each.values[0]) for each in narrow.levels]
     kept = list(zip(narrow.coefficients, shifts, strict=True))
     smooth = correction.mollified(values, task.grid)
-    for candidates in ([smooth], one_sided(smooth, task.grid, sign)):
+    smoother = correction.mollified(correction.mollified(smooth, task.grid), task.grid)
+    for candidates in ([smoother], one_sided(smooth, task.grid, sign)):
         distance = np.max((sign * values - _best(kept, sign))[task.chosen])
         if distance <= FAR * np.ptp(values[task.chosen]):
             break

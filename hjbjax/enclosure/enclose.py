@@ -84,7 +84,7 @@ def enclose(
     own, value, grid = _checked(problem, solution)
     arguments.positive(tol, "enclose: tol")
     count = arguments.count(rounds, "enclose: rounds")
-    needed = memory.fitting(_peak_bytes(own, grid), grid, max_memory)
+    needed = memory.fitting(_peak_bytes(own, grid, count), grid, max_memory)
     chosen = _chosen(region, grid)
     scale = float(np.ptp(value[chosen])) or 1.0
     with own_settings(x64=True):
@@ -186,10 +186,10 @@ def _chosen(region: Any, grid: Grid) -> np.ndarray:
     return found
 
 
-def _peak_bytes(problem: Problem, grid: Grid) -> int:
+def _peak_bytes(problem: Problem, grid: Grid, rounds: int) -> int:
     """Bytes that ``enclose`` uses at its peak: all scalars of one block of cells, and arrays at all nodes.
 
-    These are the weights of the spline, the functions of the problem and the factors of the chain.
+    These are the weights of the spline, the functions of the problem, the factors of the chain and the candidates.
     """
     n, m = grid.ndim, 0 if problem.controls is None else problem.controls.dim
     arguments: list[list[float]] = [[0.0] * n, [0.0] * m]
@@ -207,7 +207,8 @@ def _peak_bytes(problem: Problem, grid: Grid) -> int:
     if problem.target is not None:  # the parts of the cells along a boundary as large as that of the box
         known *= 1 + 2 ** (exits.DEPTH * n) * 2 * n / min(grid.shape)
     fill = 31 * np.log2(grid.size + 2) if n <= correction.DIRECT else 20
-    return int(block + grid.size * (12 * fill + 8 * 30 + known))
+    candidates = rounds * (2 + 2 * n * branches.MORE)
+    return int(block + grid.size * (12 * fill + 8 * (30 + candidates) + known))
 
 
 def _message(grid: Grid, share: float, infinite: float, tol: float, is_part: bool) -> str:

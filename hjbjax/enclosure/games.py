@@ -235,7 +235,7 @@ def by_vertices(cell: Cell) -> Interval | None:
     """The range of −H if G is affine in the inputs of boxes or has finite sets; ``None`` otherwise.
 
     H is then a minimum, or a saddle, over the vertices. For one vertex of both players G is as smooth as W, so that its
-    range is narrower than that of H near a kink. For all vertices U and D
+    range is narrower than the range of H near a kink. For all vertices U and D
 
         min_d max_u sup(−G) ≥ −H ≥ max_u min_d inf(−G).
     """

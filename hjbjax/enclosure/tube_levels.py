@@ -165,7 +165,7 @@ class TubeTask:
 
     @quietly
     def refine(self, found: Sides, chosen: np.ndarray, depth: int) -> None:
-        """Narrow the rates of some cells to those of their 2^depth parts along every axis."""
+        """Narrow the rates of some cells to the rates of their parts, 2^depth along every axis."""
         fresh = np.full(found.rate.shape, -np.inf)
         for some in _parts(np.nonzero(chosen), depth * self.mesh.ndim):
             for block in defect.blocks(self.moving, self.mesh, self.spline, some, depth):

@@ -36,7 +36,7 @@ class TubeEnclosure:
       inner: a function at the nodes, shape (*grid), that is ≤ 0 in the inner set; NaN if the inner set is empty.
       outer: a function at the nodes that is ≤ 0 in the outer set; NaN if the outer set is the whole box.
       shifts: the numbers by which the levels of W of the outer and the inner set differ from v, in units of V.
-      is_free: True if the sets are also those of the problem that continues beyond the box.
+      is_free: True if the sets also hold for the problem that continues beyond the box.
       message: the statement that is proved.
       stats: "seconds", "bytes" (the estimated memory), "cells" and "bisected", the numbers of evaluated and of bisected
         cells.

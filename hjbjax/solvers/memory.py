@@ -36,7 +36,7 @@ def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, hi
     The state is the value, the remaining rate and the policy; each evaluation creates the next state while the old one
     lives. Sweeps store the weights (one per axis without noise, two with noise) and the source twice, plain and skewed,
     in single precision. A Krylov method stores its vectors. With a scheme of high order the value of the monotone
-    iteration lives until the end, in place of the initial V, and its policy if this does not follow from the value.
+    iteration is kept until the end instead of the initial V, and its policy if this does not follow from the value.
     """
     word, n, actions = np.dtype(dtype).itemsize, len(grid.state_axes), _actions(problem)
     searched, choices = _searched(problem, grid.ndim, dtype), _choices(problem, grid)

@@ -33,7 +33,7 @@ def error_at_rest(solution: Solution, task: Task) -> float:
     places = _lowest(value, ~np.asarray(task.obstacles.fixed) & np.isfinite(value), grid)
     if not places.size:
         return 0.0
-    wanted = np.resize(places, MOST)  # always as many, for one program
+    wanted = np.resize(places, MOST)  # always the same number, for one program
     actions = [
         np.zeros((*value.shape, 0)) if each is None else each for each in (solution.policy, solution.disturbance)
     ]
@@ -47,7 +47,7 @@ def error_at_rest(solution: Solution, task: Task) -> float:
 
 
 def _lowest(value: np.ndarray, free: np.ndarray, grid: Grid) -> np.ndarray:
-    """The flat indices of free nodes with V at most that of all neighbours along the axes, lowest first, ``MOST``."""
+    """The flat indices of the ``MOST`` lowest free nodes at which V is at most V at all neighbours along the axes."""
     least = free.copy()  # comparisons of slices: the only new arrays are boolean
     for axis in range(value.ndim):
         nodes, marks = np.moveaxis(value, axis, 0), np.moveaxis(least, axis, 0)
@@ -63,7 +63,7 @@ def _lowest(value: np.ndarray, free: np.ndarray, grid: Grid) -> np.ndarray:
 def _gain_between_nodes(
     problem: Problem, grid: Grid, places: np.ndarray, actions: tuple[list, list]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the running cost next to nodes is below that of both ends of an interval, and the cost at the nodes.
+    """By how much the running cost next to nodes is below its value at both ends of an interval, and at the nodes.
 
     The first is summed over the axes, with the better of the two intervals on each axis; both (k,), cost per time.
     """

@@ -58,7 +58,7 @@ def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) 
 
 
 def _better_of(settled: Settled, sharp: Settled, clock: Clock) -> Settled:
-    """As ``better_of`` if the caller left the choice; the monotone solution may lack its actions."""
+    """The choice of ``better_of`` if the caller left it; the monotone solution may lack its actions."""
     settled = sharp.origin or settled  # with its answer on the coarser grid
     if sharp.code is not Status.CONVERGED:
         # Ctrl-C leaves the solve unfinished; after a time limit the monotone answer is complete

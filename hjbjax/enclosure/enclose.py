@@ -10,7 +10,7 @@ import numpy as np
 from hjbjax.enclosure import branches, correction, defect, exits
 from hjbjax.enclosure.bounds import Enclosure
 from hjbjax.enclosure.discounted import DiscountTask
-from hjbjax.enclosure.interpolant import Spline
+from hjbjax.enclosure.interpolant import LARGEST, Spline
 from hjbjax.enclosure.undiscounted import exit_task
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -153,8 +153,11 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
     value = np.asarray(costs.value, float)
     if problem.target is not None and value.shape == grid.shape and np.any(np.isfinite(value)):
         value = correction.nearest_known(value, np.isfinite(value), grid)  # infinite where no path meets the target
-    if value.shape != grid.shape or not np.all(np.isfinite(value)):
-        raise ValueError(f"enclose: got a value of shape {value.shape} with numbers that are not finite, or a batch")
+    if value.shape != grid.shape or not np.all(np.abs(value) <= LARGEST):
+        raise ValueError(
+            f"enclose: got a value of shape {value.shape}; wanted {grid.shape}, without numbers that are not finite\n"
+            f"or above {LARGEST:g}"
+        )
     known = in_unit_box(closures.settled(costs_of(problem), grid.ndim), grid.ndim)
     return known, value, grid
 

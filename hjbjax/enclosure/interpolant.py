@@ -26,6 +26,7 @@ Ends = Sequence[tuple[np.ndarray, np.ndarray]]
 DEGREE = 2
 POINTS = DEGREE + 1
 SEAM = 2.0**-30  # by which half cells at the ends of a periodic axis overlap: more than their rounding
+LARGEST = 1e150  # of the coefficients: nothing is known about a spline with larger ones, whose sums may overflow
 ROUNDING = 64 * EPS  # relative, of a weight on a part of a cell, and of the sum over the nodes along one axis
 
 
@@ -169,6 +170,12 @@ def _contracted(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.moveaxis(total, 0, -2)
 
 
+def known(values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Coefficients and their largest absolute value; zeros and infinity if one is too large or NaN."""
+    largest = float(np.max(np.abs(values)))
+    return (values, largest) if largest <= LARGEST else (np.zeros_like(values), np.inf)
+
+
 @dataclasses.dataclass(frozen=True)
 class Cells:
     """Parts of some cells, for any coefficients of the spline.
@@ -211,7 +218,8 @@ class Cells:
 
     def _derivatives(self, values: np.ndarray) -> dict[tuple[int, ...], tuple[Interval, Interval]]:
         """Per list of axes, at most three, the range of the derivative and its value at the centre."""
-        n, largest = len(self.rows), float(np.max(np.abs(values)))
+        n = len(self.rows)
+        values, largest = known(values)
         found: dict[tuple[int, ...], tuple[Interval, Interval]] = {}
 
         def walk(axis: int, orders: tuple[int, ...], whole: np.ndarray, middle: np.ndarray) -> None:
@@ -255,11 +263,13 @@ class Spline:
     @classmethod
     def on(cls, grid: Grid) -> "Spline":
         """The cells of the nodes of a grid."""
-        axes = [np.asarray(grid.axis(axis), float) for axis in range(grid.ndim)]
-        ends = [[float(end)] if cyclic else [] for end, cyclic in zip(grid.hi, grid.periodic, strict=True)]
-        return cls(tuple(
-            axis_table(np.append(at, end), cyclic) for at, end, cyclic in zip(axes, ends, grid.periodic, strict=True)
-        ))  # fmt: skip
+        tables = []
+        for axis, cyclic in enumerate(grid.periodic):
+            at, lo, hi = np.array(grid.axis(axis), float), float(grid.lo[axis]), float(grid.hi[axis])
+            at = np.append(at, hi) if cyclic else at
+            at[0], at[-1] = lo, hi  # nodes are rounded, and the cells must cover the whole box
+            tables.append(axis_table(at, cyclic))
+        return cls(tuple(tables))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -304,8 +314,9 @@ class Spline:
 
     def largest(self, values: np.ndarray) -> np.ndarray:
         """An upper bound of the spline with some coefficients in every cell inside the box, shape (*cells)."""
-        n, error, size = len(self.tables), np.zeros(()), np.full((), float(np.max(np.abs(values))))
-        found = values[None]
+        n, error = len(self.tables), np.zeros(())
+        values, largest = known(values)
+        size, found = np.full((), largest), values[None]
         for axis, table in enumerate(self.tables):
             weights, start, stop = table.weights[0], *(np.full(len(table.nodes), end) for end in (0.0, 1.0))
             if not table.periodic:
@@ -356,8 +367,9 @@ class States:
 
     def values(self, coefficients: np.ndarray) -> Interval:
         """The spline with these coefficients, shape (*grid), at the states."""
+        coefficients, largest = known(coefficients)
         found = coefficients[self.stencil]
         for row in self.rows:
             found = _contracted(row, found)
-        found, error = found.reshape(-1), float(np.max(np.abs(coefficients))) * self.error
+        found, error = found.reshape(-1), largest * self.error
         return Interval(found - error, found + error)

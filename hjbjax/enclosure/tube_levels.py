@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.enclosure import defect, games
-from hjbjax.enclosure.interpolant import Spline
+from hjbjax.enclosure.interpolant import Spline, known
 from hjbjax.enclosure.minimum import Cell
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -305,11 +305,15 @@ def hulls(values: np.ndarray, mesh: Grid) -> tuple[np.ndarray, np.ndarray]:
       values: the coefficients, (*mesh).
       mesh: the grid of (t, x).
     """
-    pair = [values, values]
+    values, largest = known(values)
+    # first along all axes: the continuation of the least coefficients is not the least one
     for axis, cyclic in enumerate(mesh.periodic):
+        values = np.moveaxis(_extended(np.moveaxis(values, axis, 0), cyclic), 0, axis)
+    pair = [values, values]
+    for axis in range(mesh.ndim):
         for k, join in enumerate((np.minimum, np.maximum)):
-            rows = _extended(np.moveaxis(pair[k], axis, 0), cyclic)
+            rows = np.moveaxis(pair[k], axis, 0)
             pair[k] = np.moveaxis(join(join(rows[:-2], rows[1:-1]), rows[2:]), 0, axis)
     # a ghost is at most seven times as large as its neighbours, and is rounded four times per axis
-    slack = 8 * mesh.ndim * 7.0**mesh.ndim * EPS * float(np.max(np.abs(values)))
+    slack = 8 * mesh.ndim * 7.0**mesh.ndim * EPS * largest
     return pair[0] - slack, pair[1] + slack

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hjbjax.enclosure.interpolant import Spline
+from hjbjax.enclosure.interpolant import LARGEST, Spline
 from hjbjax.enclosure.tube_levels import Sides, TubeTask
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
@@ -139,6 +139,8 @@ def enclose_tube(
     if isinstance(depth, bool) or not isinstance(depth, (int, np.integer)) or depth < 0:
         raise ValueError(f"enclose_tube: depth: got {depth!r}, wanted an integer that is not negative")
     level = float(level)
+    if not np.isfinite(level):
+        raise ValueError(f"enclose_tube: level: got {level}, wanted a finite number")
     grid = solution.grid
     needed = memory.fitting(_peak_bytes(own, values.shape), grid, max_memory)
     above = problem.inside == "above"
@@ -260,8 +262,8 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
             "zero to the horizon, as in march(problem, grid, T, times=np.linspace(0, T, 41))"
         )
     value = np.asarray(solution.value, float)
-    if value.shape != (len(times), *grid.shape) or not np.all(np.isfinite(value)):
-        raise ValueError(f"enclose_tube: got a value of shape {value.shape}, or numbers that are not finite")
+    if value.shape != (len(times), *grid.shape) or not np.all(np.abs(value) <= LARGEST):
+        raise ValueError(f"enclose_tube: got a value of shape {value.shape}, or numbers that are not below {LARGEST:g}")
     arguments.positive(horizon, "enclose_tube: horizon")
     return in_unit_box(closures.settled(problem, grid.ndim), grid.ndim), value, horizon
 

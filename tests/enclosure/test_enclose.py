@@ -317,3 +317,25 @@ def test_what_is_not_proved_is_refused():
         hjb.enclose(looked_up, solution)
     with pytest.raises(ValueError, match="infinite"):
         hjb.enclose(hjb.Problem(lambda x, u: u / x, base["cost"], base["controls"], discount=1.0), solution)
+
+
+def test_values_whose_sums_may_overflow_are_refused():
+    """A lower value by 1e307 at one node gave an upper bound of −1e307 elsewhere."""
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: jnp.abs(x[0]), hjb.Box([-1.0], [1.0]), discount=1.0)
+    grid = hjb.Grid([-1.0], [1.0], (40,))
+    values = np.where(np.arange(40) == 3, -1e307, np.abs(np.asarray(grid.axis(0), float)))
+    with pytest.raises(ValueError, match="above 1e"):
+        hjb.enclose(problem, hjb.Solution(grid, values, None, code=hjb.Status.CONVERGED))
+    spline = Spline.on(grid)
+    assert np.all(np.isinf(spline.largest(values)))
+    assert np.all(np.isinf(spline.at(np.zeros((1, 1))).values(values).lo))
+
+
+def test_the_cells_cover_the_box():
+    """The formula of the nodes rounds: on one of ten axes an end node is not the end of the box."""
+    draw = np.random.default_rng(0)
+    for _ in range(40):
+        lo, hi = np.sort(draw.uniform(-3, 3, 2))
+        for cyclic in (False, True):
+            (table,) = Spline.on(hjb.Grid([lo], [hi], (int(draw.integers(3, 90)),), periodic=(cyclic,))).tables
+            assert (table.at[0], table.at[-1]) == (lo, hi)

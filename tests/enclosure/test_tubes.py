@@ -1,12 +1,14 @@
 """The inner set is in the tube and the outer set contains it, by exact answers and by oracles in plain NumPy."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hjbjax as hjb
 from hjbjax.enclosure.interpolant import Spline
-from hjbjax.enclosure.tube_levels import hulls
+from hjbjax.enclosure.tube_levels import hulls, spline_coefficients
 
 UNIT, HALF = hjb.Box([-1.0], [1.0]), hjb.Box([-0.5], [0.5])
 
@@ -201,6 +203,45 @@ def test_the_hulls_of_the_coefficients_contain_the_spline():
     assert np.all(least <= 1e-11 - spline.largest(-values))
 
 
+def test_the_hulls_contain_the_spline_at_corners():
+    """There the coefficients continue along several axes."""
+    draw = np.random.default_rng(0)
+    for shape in ((5, 8), (4, 5, 5)):
+        zero = np.zeros(len(shape))
+        grid = hjb.Grid(zero, zero + 1, shape)
+        for _ in range(10):
+            values, spline = draw.integers(-3, 4, shape).astype(float), Spline.on(grid)
+            least, most = hulls(values, grid)
+            states = np.round(8 * draw.uniform(size=(3000, len(shape)))) / 8
+            index, found = spline.index(states), spline.at(states).values(values)
+            assert np.all(least[index] <= found.hi)
+            assert np.all(found.lo <= most[index])
+
+
+def test_wrong_values_next_to_a_wall_do_not_exclude_its_states():
+    """W is large at the lower end at t = 0 only, where the target is, because the value next to it is small."""
+    problem = hjb.reach(lambda x, u: u, hjb.Box([-0.1], [0.1]), lambda x: x[0] + 0.5)
+    solution = marched(problem, hjb.Grid([-1.0], [1.0], (9,)), 1.0, 6)
+    coefficients = np.repeat(20 * np.linspace(-1, 0, 6)[:, None], 9, axis=1)
+    coefficients[0, 1] -= 200
+    values, mesh = coefficients, hjb.Grid([0.0, -1.0], [1.0, 1.0], (6, 9), edges=("open", "projected"))
+    for _ in range(60):  # the values with these coefficients
+        values = values + (coefficients - spline_coefficients(values, mesh))
+    found = hjb.enclose_tube(problem, dataclasses.replace(solution, value=values))
+    assert np.all(found.outer_at(np.linspace(-1, -0.41, 60)[:, None]))
+
+
+@pytest.mark.parametrize(("where", "number"), [((-1, slice(None)), 1e307), ((0, 0), -1.7e308), ((-1, 3), -1.7e308)])
+def test_values_whose_sums_may_overflow_are_refused(where, number):
+    """They gave wrong inner and outer sets."""
+    problem = hjb.reach(lambda x, u: u, UNIT, size)
+    solution = marched(problem, hjb.Grid([-1.0], [1.0], (9,)), 0.5, 6)
+    values = np.array(solution.value, float)
+    values[where] = number
+    with pytest.raises(ValueError, match="not below 1e"):
+        hjb.enclose_tube(problem, dataclasses.replace(solution, value=values))
+
+
 def test_tubes_without_a_proof_are_refused():
     grid, problem = hjb.Grid([-2.0], [2.0], (41,)), hjb.reach(lambda x, u: u, UNIT, size)
     solution = marched(problem, grid, 1.0, 5)
@@ -214,6 +255,8 @@ def test_tubes_without_a_proof_are_refused():
         hjb.enclose_tube(problem, solution, max_memory=1000)
     with pytest.raises(ValueError, match="depth"):
         hjb.enclose_tube(problem, solution, depth=-1)
+    with pytest.raises(ValueError, match="level"):
+        hjb.enclose_tube(problem, solution, level=np.nan)
     ends = marched(problem, hjb.Grid([-2.0], [2.0], (41,), edges="open"), 1.0, 5)
     with pytest.raises(ValueError, match="open ends"):
         hjb.enclose_tube(problem, ends)

@@ -121,7 +121,7 @@ def estimate(
       >>> import hjbjax as hjb
       >>> problem, grid = hjb.zoo.manipulator(links=2, shape=(200,) * 4)
       >>> hjb.estimate(problem, grid, dtype="float32", measure=False).bytes // grid.size
-      90
+      74
     """
     check_arguments(problem, grid, method, scheme, tol)
     asked, problem = problem, in_own_time(in_unit_box(costs_of(problem), grid.ndim))  # memory does not depend on a sign

@@ -119,8 +119,9 @@ def _slope_in_time(
     half, identity = 0.5 * np.diff(s)[:, None, None], np.eye(m)
     # trapezoidal rule: −(I + ½hA) δz_k + (I − ½hA) δz_{k+1} = ½h (b_k + b_{k+1}) δT
     left, right = -identity - half * matrices[:-1], identity - half * matrices[1:]
-    steps = sparse.hstack([sparse.block_diag(left), sparse.csr_matrix(((count - 1) * m, m))])
-    steps = steps + sparse.hstack([sparse.csr_matrix(((count - 1) * m, m)), sparse.block_diag(right)])
+    blocks = [sparse.block_diag([sparse.coo_matrix(each) for each in side]) for side in (left, right)]
+    empty = sparse.csr_matrix(((count - 1) * m, m))
+    steps = sparse.hstack([blocks[0], empty]) + sparse.hstack([empty, blocks[1]])
     begin = sparse.csr_matrix(identity[: m // 2])
     ends = [sparse.csr_matrix(closing[rows]), sparse.csr_matrix(sliding[rows, 1:])]
     nothing = sliding.shape[1] - 1

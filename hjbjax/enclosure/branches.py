@@ -38,13 +38,17 @@ def bound(
     narrow, sizes = task.bound(values, found, move, sign, rounds)
     shifts = [-sign * float(each.values[0]) for each in narrow.levels]
     kept = list(zip(narrow.coefficients, shifts, strict=True))
-    smooth = correction.mollified(values, task.grid)
-    smoother = correction.mollified(correction.mollified(smooth, task.grid), task.grid)
-    for candidates in ([smoother], one_sided(smooth, task.grid, sign)):
+
+    def is_far() -> bool:
         distance = np.max((sign * values - _best(kept, sign))[task.chosen])
-        if distance <= FAR * np.ptp(values[task.chosen]):
-            break
-        kept += further(task, candidates, kept, sign, MORE * rounds)
+        return bool(distance > FAR * np.ptp(values[task.chosen]))
+
+    if is_far():
+        smooth = correction.mollified(values, task.grid)
+        smoother = correction.mollified(correction.mollified(smooth, task.grid), task.grid)
+        kept += further(task, [smoother], kept, sign, MORE * rounds)
+        if is_far():
+            kept += further(task, extrapolations(smooth, task.grid, sign), kept, sign, MORE * rounds)
     for candidate, shift in kept[len(shifts) :]:
         narrow = narrow.with_candidate(candidate, Levels.shifted(shift, sign))
     return narrow, sizes
@@ -55,7 +59,7 @@ def _best(kept: Kept, sign: int) -> np.ndarray:
     return np.max([sign * each - shift for each, shift in kept], axis=0)
 
 
-def one_sided(values: np.ndarray, grid: Grid, sign: int) -> list[np.ndarray]:
+def extrapolations(values: np.ndarray, grid: Grid, sign: int) -> list[np.ndarray]:
     """The extrapolations of smooth values along both directions of every axis, shape (*grid) each.
 
     Where one reads beyond an end of the box it is lowered (``sign`` 1, for lower bounds) or raised (−1).
@@ -65,8 +69,7 @@ def one_sided(values: np.ndarray, grid: Grid, sign: int) -> list[np.ndarray]:
         count = grid.shape[axis]
         if count < 4 * STEP:
             continue
-        pad = [(2 * STEP * (other == axis),) * 2 for other in range(grid.ndim)]
-        wide = np.pad(values, pad, mode="wrap") if cyclic else np.pad(values, pad, mode="reflect", reflect_type="odd")
+        wide = correction.continued(values, axis, 2 * STEP, cyclic=cyclic)
         ramp = np.maximum(0, 1 - np.arange(count) / (2 * STEP)) ** 2 * (RISE * np.ptp(values) * (not cyclic))
         for direction in (1, -1):
             near, far = (np.take(wide, np.arange(count) + 2 * STEP - k * direction * STEP, axis=axis) for k in (1, 2))

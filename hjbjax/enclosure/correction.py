@@ -83,14 +83,19 @@ def smooth_cover(excess: np.ndarray, grid: Grid) -> np.ndarray:
     return MARGIN * excess
 
 
+def continued(values: np.ndarray, axis: int, count: int, *, cyclic: bool) -> np.ndarray:
+    """Values with this number of nodes more beyond both ends of an axis, continued linearly unless it is periodic."""
+    pad = [(count * (other == axis),) * 2 for other in range(values.ndim)]
+    mode: dict[str, Any] = {"mode": "wrap"} if cyclic else {"mode": "reflect", "reflect_type": "odd"}
+    return np.pad(values, pad, **mode)
+
+
 def mollified(values: np.ndarray, grid: Grid) -> np.ndarray:
     """Means over nearby nodes, three on both sides of each; linear functions do not change, also at the ends."""
     from scipy.ndimage import correlate1d
 
     for axis, cyclic in enumerate(grid.periodic):
-        pad = [(3 * (other == axis),) * 2 for other in range(grid.ndim)]
-        mode: dict[str, Any] = {"mode": "wrap"} if cyclic else {"mode": "reflect", "reflect_type": "odd"}
-        wide = correlate1d(np.pad(values, pad, **mode), MEAN, axis)
+        wide = correlate1d(continued(values, axis, 3, cyclic=cyclic), MEAN, axis)
         values = np.take(wide, range(3, wide.shape[axis] - 3), axis=axis)
     return values
 

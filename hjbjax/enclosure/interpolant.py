@@ -170,7 +170,7 @@ def _contracted(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.moveaxis(total, 0, -2)
 
 
-def known(values: np.ndarray) -> tuple[np.ndarray, float]:
+def with_largest(values: np.ndarray) -> tuple[np.ndarray, float]:
     """Coefficients and their largest absolute value; zeros and infinity if one is too large or NaN."""
     largest = float(np.max(np.abs(values)))
     return (values, largest) if largest <= LARGEST else (np.zeros_like(values), np.inf)
@@ -219,7 +219,7 @@ class Cells:
     def _derivatives(self, values: np.ndarray) -> dict[tuple[int, ...], tuple[Interval, Interval]]:
         """Per list of axes, at most three, the range of the derivative and its value at the centre."""
         n = len(self.rows)
-        values, largest = known(values)
+        values, largest = with_largest(values)
         found: dict[tuple[int, ...], tuple[Interval, Interval]] = {}
 
         def walk(axis: int, orders: tuple[int, ...], whole: np.ndarray, middle: np.ndarray) -> None:
@@ -315,7 +315,7 @@ class Spline:
     def largest(self, values: np.ndarray) -> np.ndarray:
         """An upper bound of the spline with some coefficients in every cell inside the box, shape (*cells)."""
         n, error = len(self.tables), np.zeros(())
-        values, largest = known(values)
+        values, largest = with_largest(values)
         size, found = np.full((), largest), values[None]
         for axis, table in enumerate(self.tables):
             weights, start, stop = table.weights[0], *(np.full(len(table.nodes), end) for end in (0.0, 1.0))
@@ -367,7 +367,7 @@ class States:
 
     def values(self, coefficients: np.ndarray) -> Interval:
         """The spline with these coefficients, shape (*grid), at the states."""
-        coefficients, largest = known(coefficients)
+        coefficients, largest = with_largest(coefficients)
         found = coefficients[self.stencil]
         for row in self.rows:
             found = _contracted(row, found)

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.enclosure import defect, games
-from hjbjax.enclosure.interpolant import Spline, known
+from hjbjax.enclosure.interpolant import Spline, with_largest
 from hjbjax.enclosure.minimum import Cell
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -305,7 +305,7 @@ def hulls(values: np.ndarray, mesh: Grid) -> tuple[np.ndarray, np.ndarray]:
       values: the coefficients, (*mesh).
       mesh: the grid of (t, x).
     """
-    values, largest = known(values)
+    values, largest = with_largest(values)
     # first along all axes: the continuation of the least coefficients is not the least one
     for axis, cyclic in enumerate(mesh.periodic):
         values = np.moveaxis(_extended(np.moveaxis(values, axis, 0), cyclic), 0, axis)

@@ -18,7 +18,7 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers.coarse_levels import CoarserAnswer
 from hjbjax.solvers.order import at_order
 from hjbjax.solvers.setup import Assumptions, forced_only
-from hjbjax.solvers.stationary_run import evaluated, iterate
+from hjbjax.solvers.stationary_run import evaluated_state, iterate
 from hjbjax.solvers.vanishing_discounts import FURTHER, follow, needs_a_way, warm
 from hjbjax.well_posedness import resting
 
@@ -60,7 +60,7 @@ class Settled(NamedTuple):
         """The same result with its policy, which is computed again if it was left out."""
         if self.task.bare or jnp.ndim(self.state.policy.defect):
             return self
-        policy = evaluated(self.running, self.state.value).policy
+        policy = evaluated_state(self.running, self.state.value).policy
         return self._replace(state=dataclasses.replace(self.state, policy=policy))
 
     @property

@@ -85,7 +85,7 @@ def iterate(task: Task, guess: Nodes, clock: Clock, most: int | None = None) -> 
     return state, status, np.concatenate(iteration.residuals)[: int(state.progress.evaluations)]
 
 
-def evaluated(task: Task, value: Nodes) -> State:
+def evaluated_state(task: Task, value: Nodes) -> State:
     """The state of a value after its evaluation, by the program of the iteration, on any devices and at any time."""
     iteration = _iteration(task, value, 0)
     iteration.advance(1)

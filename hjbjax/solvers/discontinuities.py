@@ -14,14 +14,14 @@ is solved on a grid that is small enough to factor, with the mean of its right-h
 """
 
 import dataclasses
-import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.discretisation import stencil
-from hjbjax.discretisation.rates import jump_rates
+from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy
 from hjbjax.iteration.fixed_point import Task
@@ -43,7 +43,7 @@ def error_at_discontinuities(solution: Solution, task: Task) -> np.ndarray | Non
         return None
     least, most = np.min(value, where=finite, initial=np.inf), np.max(value, where=finite, initial=-np.inf)
     filled = np.where(finite, value, most)
-    source, step = jax.device_get(_jumps(task, filled, solution.policy, solution.disturbance))
+    source, step = _jumps(solution, task, filled)
     if not np.max(step) > LEAST * (most - least):
         return None
     level = factored_level.small_enough(task)
@@ -53,55 +53,83 @@ def error_at_discontinuities(solution: Solution, task: Task) -> np.ndarray | Non
     return None if error is None else nested_grids.prolong(error, level.grid, task.grid)
 
 
-@jax.jit
-def _jumps(task: Task, value: Field, policy: Field, disturbance: Field | None) -> tuple[Field, Field]:
+def _jumps(solution: Solution, task: Task, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mean error of the rate H on the moves from each node, per unit time, and its cost on one move, (*grid)."""
     on, grid = task.on.chain, task.grid
-    x, slopes = on.coordinates(), [_central(value, grid, axis) for axis in range(grid.ndim)]
-    u, d = ([] if each is None else list(jnp.moveaxis(each, -1, 0)) for each in (policy, disturbance))
+    u, d = (
+        [] if each is None else list(np.moveaxis(np.asarray(each), -1, 0))
+        for each in (solution.policy, solution.disturbance)
+    )
+    x = [np.asarray(each) for each in on.coordinates()]
+    slopes = [_slope(value, grid, axis) for axis in range(grid.ndim)]
+    obstacles = jax.device_get(task.obstacles)
+    loose = np.broadcast_to(np.logical_not(obstacles.fixed), grid.shape)
+    total, moving = np.zeros(grid.shape, value.dtype), np.zeros(grid.shape, value.dtype)
+    for axis, step in itertools.product(grid.state_axes, (-1, 1)):
+        link = stencil.grid_links(grid, axis)
+        shift, unit = [np.zeros_like(each) for each in x], [0.0] * grid.ndim
+        shift[axis] = shift[axis] + step * np.asarray(link.up if step > 0 else link.down, value.dtype)
+        unit[axis] = float(step)
+        missed, rate = jax.device_get(_missed(on, x, shift, (u, d), (value, slopes), unit))
+        # beyond the boundary of a target nothing is paid, and a cost may be undefined there
+        total += np.where(_next_to(loose, grid, axis, step), missed, 0)
+        moving += rate
+    moves = np.asarray(obstacles.acting(value)) & (moving > 0)
+    source = np.divide(total, moving, out=np.zeros_like(total), where=moves)
+    return source, np.divide(source, moving, out=np.zeros_like(total), where=moves)
 
-    def rate_at(offset: tuple[int, ...], share: float) -> tuple[Field, list]:
-        """H and f at x + share (y − x)."""
-        z = [_towards(c, grid, axis, share * offset[axis]) for axis, c in enumerate(x)]
+
+@jax.jit
+def _missed(
+    on: Discretisation, x: list, shift: list, actions: tuple[list, list], around: tuple[Field, list], unit: list
+) -> tuple[Field, Field]:
+    """The rate of moves in one direction times the error of H on them, and this rate, (*grid).
+
+    Args:
+      on: the problem on its grid.
+      x: the coordinates of the nodes.
+      shift: the way to the neighbour, one entry per axis.
+      actions: u and d.
+      around: V and its slope along every axis.
+      unit: ±1 for the axis of the neighbour, 0 for the others.
+    """
+    (u, d), (value, slopes) = actions, around
+
+    def rate_at(share: float) -> tuple[Field, Field]:
+        """H at x + share (y − x), and the drift towards y."""
+        z = [entry + share * step for entry, step in zip(x, shift, strict=True)]
         f, growth = on.drift(u, d, z), on.growth(u, d, z)
         paid = on.running_cost(u, d, z) + sum(each * value for each in growth)
-        return paid + sum(f[axis] * slopes[axis] for axis in grid.state_axes), f
+        gain = sum(rate * slope for rate, slope in zip(f, slopes, strict=True))
+        return paid + gain, sum(rate * sign for rate, sign in zip(f, unit, strict=True))
 
-    here, f = rate_at((0,) * grid.ndim, 0)
-    total = moving = jnp.zeros(grid.shape, on.dtype)
-    rates, loose, random = jump_rates(on, u, d), ~task.obstacles.fixed, on.problem.noise is not None
-    for offset, c in zip(rates.offsets, rates.values, strict=True):
-        (middle, _), (there, beyond), (behind, _) = (rate_at(offset, share) for share in (0.5, 1, -1))
-        jump = jnp.abs(here - 2 * middle + there)
-        near = jnp.abs(middle - here) > jnp.abs(there - middle)
-        jump = jnp.where(jump > SMOOTH * jnp.abs(behind - 2 * here + there), jump, 0) * jnp.where(near, 1, 0.5)
-        # beyond the boundary of a target nothing is paid, and a cost may be undefined there
-        counts = (c > 0) & jnp.isfinite(jump) & stencil.neighbour(loose, grid, offset)
-        if not random:  # a path that comes to rest between x and y does not get to y
-            counts &= functools.reduce(
-                jnp.logical_and, (jnp.abs(f[i]) > jnp.abs(beyond[i] - f[i]) for i, step in enumerate(offset) if step)
-            )
-        total, moving = total + jnp.where(counts, c * jump, 0), moving + c
-    moves = task.obstacles.acting(value) & (moving > 0)
-    source = jnp.where(moves, total / jnp.where(moves, moving, 1), 0)
-    return source, jnp.where(moves, source / jnp.where(moves, moving, 1), 0)
+    (behind, _), (here, f), (middle, _), (there, beyond) = (rate_at(share) for share in (-1, 0, 0.5, 1))
+    jump = jnp.abs(here - 2 * middle + there)
+    near = jnp.abs(middle - here) > jnp.abs(there - middle)
+    jump = jnp.where(jump > SMOOTH * jnp.abs(behind - 2 * here + there), jump, 0) * jnp.where(near, 1, 0.5)
+    length, noise = sum(jnp.abs(step) for step in shift), on.diffusion(u, d)
+    rate = jnp.maximum(f, 0) / length + sum(unit[i] ** 2 * a for (i, j), a in noise.items() if i == j) / (2 * length**2)
+    # without noise, a path that comes to rest between x and y does not get to y
+    counts = jnp.isfinite(jump) & ((jnp.abs(f) > jnp.abs(beyond - f)) | (on.problem.noise is not None))
+    shape = on.grid.shape
+    return jnp.broadcast_to(jnp.where(counts, rate * jump, 0), shape), jnp.broadcast_to(rate, shape)
 
 
-def _central(value: Field, grid: Grid, axis: int) -> Field:
+def _next_to(nodes: np.ndarray, grid: Grid, axis: int, step: int) -> np.ndarray:
+    """True where the neighbour is one of the nodes, bool (*grid)."""
+    found = np.roll(nodes, -step, axis)
+    if not grid.periodic[axis]:
+        found[(slice(None),) * axis + (-1 if step > 0 else 0,)] = False
+    return found
+
+
+def _slope(value: np.ndarray, grid: Grid, axis: int) -> np.ndarray:
     """The slope of V along an axis by central differences, one-sided at the ends of the box."""
-    up, down = stencil.one_sided(value, grid, axis)
-    if grid.periodic[axis]:
-        return (up + down) / 2
-    first, last = (stencil.on_edge(grid, axis, step) for step in (-1, 1))
-    return jnp.where(first, up, jnp.where(last, down, (up + down) / 2))
-
-
-def _towards(x: Field, grid: Grid, axis: int, share: float) -> Field:
-    """A coordinate at a share of the way to the next node, above if it is positive, or else below."""
-    if share == 0 or axis not in grid.state_axes:
-        return x
-    link = stencil.grid_links(grid, axis)
-    return x + share * (link.up if share > 0 else link.down)
+    if axis not in grid.state_axes:
+        return np.zeros_like(value)
+    if not grid.periodic[axis]:
+        return np.gradient(value, np.asarray(grid.axis(axis)), axis=axis)
+    return (np.roll(value, -1, axis) - np.roll(value, 1, axis)) / (2 * float(grid.spacing(axis)))
 
 
 def _along_paths(level: Task, value: np.ndarray, source: np.ndarray, fine: Grid) -> np.ndarray | None:

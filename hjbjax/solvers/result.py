@@ -146,7 +146,8 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer
         chain=None if origin is None else np.asarray(origin.state.value),
         highest=_highest(settled),
     )
-    error = np.maximum(grid_error.estimate_error(answers), value.dtype.type(error_at_rest(solution, settled.task)))
+    error = grid_error.estimate_error(answers)
+    error = np.maximum(error, value.dtype.type(error_at_rest(solution, settled.task, float(np.max(error)))))
     missed = error_at_discontinuities(solution, settled.task)
     error = error if missed is None else np.maximum(error, missed.astype(value.dtype))
     error += _left(solution, settled, error)

@@ -85,3 +85,55 @@ def test_a_cost_may_be_undefined_between_nodes():
     solution = hjb.solve(problem, grid)
     error = np.max(np.abs(solution.value - value(np.abs(grid.axis(0)), 2.0, 1.0)))
     assert error <= 3 * np.max(solution.grid_error) <= 0.02
+
+
+def wave(amplitude, centre, x):
+    return -amplitude * jnp.prod(jnp.cos(3 * (x - centre)))
+
+
+def pushed(speed, wind, x, u):
+    return wind * jnp.cos(x) + speed * u
+
+
+def narrow(value, speed, wind, weight, discount, x, u):
+    """The running cost for which ``value`` solves β V = min{L + f V′} with |u| ≤ 1."""
+    slope = jax.grad(value)(x)
+    best = jnp.clip(-speed * slope / (2 * weight), -1, 1)
+    least = jnp.sum(speed * best * slope + weight * best**2)
+    return discount * value(x) - wind * jnp.cos(x) @ slope - least + weight * u @ u
+
+
+def manufactured(axes, centre, wind, amplitude, unit=1.0):
+    exact, speed, weight, discount = partial(wave, unit * amplitude, np.array(centre)), 1.7, 0.5 * unit, 0.12
+    return exact, hjb.Problem(
+        partial(pushed, speed, wind),
+        partial(narrow, exact, speed, wind, weight, discount),
+        hjb.Box([-1.0] * axes, [1.0] * axes),
+        discount=discount,
+    )
+
+
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
+@pytest.mark.parametrize("unit", [1.0, 1e5])
+@pytest.mark.parametrize("wind", [0.0, 0.3, -0.5])
+@pytest.mark.parametrize("centre", [0.03, 0.05, 0.079])
+def test_it_sees_a_narrow_minimum_that_no_path_of_the_grid_stays_at(centre, wind, unit):
+    """V is smooth, but L/β at rest rises by more than the range of V from its minimum to the nearest node."""
+    grid = hjb.Grid([0.0], [2 * np.pi], (40,), periodic=(True,))
+    exact, problem = manufactured(1, [centre], wind, 2.0, unit)
+    solution = hjb.solve(problem, grid, tol=1e-4 * unit)
+    error = np.abs(solution.value - jax.vmap(exact)(grid.nodes()))
+    assert error.max() > 0.2 * unit
+    assert 1 / 3 < solution.grid_error.max() / error.max() < 3
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
+@pytest.mark.parametrize("centre", [(0.03, 0.05), (0.079, 0.079)])
+def test_it_sees_a_narrow_minimum_in_the_plane(centre):
+    grid = hjb.Grid([0.0, 0.0], [2 * np.pi, 2 * np.pi], (40, 36), periodic=(True, True))
+    exact, problem = manufactured(2, centre, 0.3, 2.0)
+    solution = hjb.solve(problem, grid)
+    error = np.abs(solution.value - jax.vmap(jax.vmap(exact))(grid.nodes()))
+    assert error.max() > 0.2
+    assert 1 / 3 < solution.grid_error.max() / error.max() < 3

@@ -115,7 +115,7 @@ def manufactured(axes, centre, wind, amplitude, unit=1.0):
 
 @pytest.mark.filterwarnings("ignore:the grid is coarse")
 @pytest.mark.parametrize("unit", [1.0, 1e5])
-@pytest.mark.parametrize("wind", [0.0, 0.3, -0.5])
+@pytest.mark.parametrize("wind", [0.0, 0.3])
 @pytest.mark.parametrize("centre", [0.03, 0.05, 0.079])
 def test_it_sees_a_narrow_minimum_that_no_path_of_the_grid_stays_at(centre, wind, unit):
     """V is smooth, but L/β at rest rises by more than the range of V from its minimum to the nearest node."""

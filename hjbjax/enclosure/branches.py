@@ -69,7 +69,7 @@ def extrapolations(values: np.ndarray, grid: Grid, sign: int) -> list[np.ndarray
         count = grid.shape[axis]
         if count < 4 * STEP:
             continue
-        wide = correction.continued(values, axis, 2 * STEP, cyclic=cyclic)
+        wide = correction.pad(values, axis, 2 * STEP, cyclic=cyclic)
         ramp = np.maximum(0, 1 - np.arange(count) / (2 * STEP)) ** 2 * (RISE * np.ptp(values) * (not cyclic))
         for direction in (1, -1):
             near, far = (np.take(wide, np.arange(count) + 2 * STEP - k * direction * STEP, axis=axis) for k in (1, 2))

@@ -39,14 +39,6 @@ def on_nodes(cells: np.ndarray, grid: Grid, join: Callable[..., Any] = np.mean) 
     return cells
 
 
-def generator(problem: Problem, grid: Grid, policy: np.ndarray, t: float = 0.0) -> Any:
-    """The generator of the Markov chain under the controls of both players, a sparse matrix."""
-    count = 0 if problem.controls is None else problem.controls.dim
-    own, other = policy[..., :count], policy[..., count:]
-    disturbance = other if problem.is_game else None
-    return chain.generator(problem, grid, own if count else None, disturbance=disturbance, t=t)
-
-
 def solver(problem: Problem, grid: Grid, policy: np.ndarray, rate: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """The solution E of (β − L^π) E = s as a function of s.
 
@@ -60,7 +52,9 @@ def solver(problem: Problem, grid: Grid, policy: np.ndarray, rate: np.ndarray) -
     from scipy.sparse.linalg import bicgstab, splu
 
     without = altered(problem, discount=1.0) if callable(problem.discount) else problem
-    matrix = (diags_array(rate.ravel()) - generator(without, grid, policy)).tocsc()
+    count = 0 if problem.controls is None else problem.controls.dim
+    own, other = policy[..., :count] if count else None, policy[..., count:] if problem.is_game else None
+    matrix = (diags_array(rate.ravel()) - chain.generator(without, grid, own, disturbance=other)).tocsc()
     if grid.ndim <= DIRECT:
         factors = splu(matrix)
         return lambda source: factors.solve(source.ravel()).reshape(grid.shape)
@@ -83,11 +77,11 @@ def smooth_cover(excess: np.ndarray, grid: Grid) -> np.ndarray:
     return MARGIN * excess
 
 
-def continued(values: np.ndarray, axis: int, count: int, *, cyclic: bool) -> np.ndarray:
-    """Values with this number of nodes more beyond both ends of an axis, continued linearly unless it is periodic."""
-    pad = [(count * (other == axis),) * 2 for other in range(values.ndim)]
+def pad(values: np.ndarray, axis: int, count: int, *, cyclic: bool) -> np.ndarray:
+    """Values with ``count`` more nodes beyond both ends of an axis: linear extrapolations, or periodic."""
+    widths = [(count * (other == axis),) * 2 for other in range(values.ndim)]
     mode: dict[str, Any] = {"mode": "wrap"} if cyclic else {"mode": "reflect", "reflect_type": "odd"}
-    return np.pad(values, pad, **mode)
+    return np.pad(values, widths, **mode)
 
 
 def mollified(values: np.ndarray, grid: Grid) -> np.ndarray:
@@ -95,7 +89,7 @@ def mollified(values: np.ndarray, grid: Grid) -> np.ndarray:
     from scipy.ndimage import correlate1d
 
     for axis, cyclic in enumerate(grid.periodic):
-        wide = correlate1d(continued(values, axis, 3, cyclic=cyclic), MEAN, axis)
+        wide = correlate1d(pad(values, axis, 3, cyclic=cyclic), MEAN, axis)
         values = np.take(wide, range(3, wide.shape[axis] - 3), axis=axis)
     return values
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.enclosure.cell_functions import Cell, cost_form, gain
 from hjbjax.problem.sets import Ball, Box, Finite, Simplex, is_unbounded, ranges
 from hjbjax.tracing import intervals as iv
 from hjbjax.tracing import quadratics as qu
@@ -26,44 +26,6 @@ from hjbjax.tracing.taylor_forms import Form
 
 PIECES = {1: 64, 2: 16, 3: 8}  # pieces per input where there is no formula
 Actions = list[Interval]  # the range of every input
-
-
-@dataclasses.dataclass(frozen=True)
-class Functions:
-    """The functions of a problem over parts of cells.
-
-    Attributes:
-      problem: a problem of one player with costs.
-      x: the state.
-      radii: the largest distance from the centre along every axis.
-      rate: the discount.
-      unit: the positive number by which a defect is divided: the discount, or without one a lower bound of the cost,
-        or one in a tube.
-      options: cost and drift as polynomials of the control, or for every action of a finite set; empty if they are not
-        quadratic polynomials.
-    """
-
-    problem: Problem
-    x: list[Form]
-    radii: list[np.ndarray]
-    rate: Form
-    unit: Interval
-    options: list[tuple[qu.Polynomial, list[qu.Polynomial]]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-    """A candidate W over parts of cells.
-
-    Attributes:
-      functions: the functions of the problem.
-      w: the candidate.
-      p: its gradient.
-    """
-
-    functions: Functions
-    w: Form
-    p: list[Form]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,44 +47,7 @@ class CellDefect:
     policy: np.ndarray
 
 
-def functions(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> Functions:
-    """The functions of a problem over parts of cells.
-
-    Args:
-      problem: a problem of one player with costs.
-      x: the state.
-      radii: the largest distance from the centre along every axis.
-    """
-    rate, unit = rate_and_unit(problem, x, radii)
-    options: list[tuple[qu.Polynomial, list[qu.Polynomial]]] = []
-    if isinstance(problem.controls, Finite):
-        for u in np.asarray(problem.controls.points, float):
-            action = [tf.constant(each) for each in u]
-            drift = tf.taylor_forms(problem.drift, x, action)
-            paid = qu.Polynomial({(): _running_cost(problem, x, action)})
-            options.append((paid, [qu.Polynomial({(): each}) for each in drift]))
-        return Functions(problem, x, radii, rate, unit, options)
-    count = 0 if problem.controls is None else problem.controls.dim
-    with contextlib.suppress(qu.NotQuadraticError):
-        cost = qu.Polynomial({(): tf.constant(0.0)})
-        if problem.cost is not None:
-            cost = qu.quadratics(problem.cost, x, count)[0]
-        options.append((cost, qu.quadratics(problem.drift, x, count)))
-    return Functions(problem, x, radii, rate, unit, options)
-
-
-def rate_and_unit(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> tuple[Form, Interval]:
-    """The discount, and the number by which a defect is divided, see ``Functions``."""
-    (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
-    if is_discounted(problem):  # an interval that contains zero makes the defect infinite
-        return rate, rate.range
-    if problem.target is None:  # a tube, where only the sign of the defect counts
-        return rate, point(1.0)
-    least = _running_cost(problem, x, *any_actions(problem)).bounds(radii).lo
-    return rate, point(np.maximum(least, 0.0))
-
-
-def cell_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
+def control_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
     """The defect of a candidate.
 
     Args:
@@ -144,11 +69,7 @@ def _by_formula(
     known = cell.functions
 
     def defect(without: frozenset[int]) -> tuple[Interval, Actions, list[np.ndarray]]:
-        total = cost
-        for i, (component, slope) in enumerate(zip(drift, cell.p, strict=True)):
-            if i not in without:
-                total = total + component * qu.Polynomial({(): slope})
-        least, actions, near = least_over(known.problem.controls, total)
+        least, actions, near = least_over(known.problem.controls, gain(cost, drift, cell.p, without))
         return (known.rate * cell.w - least).bounds(known.radii), actions, near
 
     found, actions, near = defect(frozenset())
@@ -338,7 +259,7 @@ def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
     costs: dict[frozenset[int], list[Form]] = {each: [] for each in (frozenset[int](), *stopped)}
     for paid, drift in known.options:
         for without, found in costs.items():
-            found.append(_hamiltonian(paid[()], [each[()] for each in drift], cell.p, without))
+            found.append(gain(paid[()], [each[()] for each in drift], cell.p, without))
     whole = known.rate * cell.w
     points, gains = np.asarray(known.problem.controls.points, float), [each.centre.lo for each in costs[frozenset()]]
     best = np.argmin(np.stack(np.broadcast_arrays(*gains)), axis=0)
@@ -347,31 +268,6 @@ def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
     return CellDefect(
         bounds[frozenset()], known.unit, {each: bounds[each].hi for each in stopped}, speeds, points[best]
     )
-
-
-def any_actions(problem: Problem) -> list[list[Form]]:
-    """Every input of each player as one interval."""
-    return [any_action(each) for each in (problem.controls, problem.disturbances)[: 1 + problem.is_game]]
-
-
-def any_action(admissible: Any) -> list[Form]:
-    """Every input of the control as one interval."""
-    if admissible is None:
-        return []
-    inputs = [Interval(np.asarray(lo), np.asarray(hi)) for lo, hi in zip(*ranges(admissible), strict=True)]
-    return [Form(each, each) for each in inputs]
-
-
-def _running_cost(problem: Problem, x: list[Form], *inputs: list[Form]) -> Form:
-    return tf.constant(0.0) if problem.cost is None else tf.taylor_forms(problem.cost, x, *inputs).item()
-
-
-def _hamiltonian(paid: Form, drift: Sequence[Form], p: Sequence[Form], without: frozenset[int]) -> Form:
-    """L + f·p, without some components of the drift."""
-    for i, (component, slope) in enumerate(zip(drift, p, strict=True)):
-        if i not in without:
-            paid = paid + component * slope
-    return paid
 
 
 def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
@@ -389,12 +285,12 @@ def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
         ]
         action = tf.coordinates(box, [point(c) for c in centre], n + len(box), n)
         drift = list(tf.taylor_forms(problem.drift, known.x, action))
-        paid = _running_cost(problem, known.x, action)
+        paid = cost_form(problem, known.x, action)
         for without in high:
-            gain = whole - _hamiltonian(paid, drift, cell.p, without)
-            high[without] = np.maximum(high[without], gain.bounds(radii).hi)
+            own = whole - gain(paid, drift, cell.p, without)
+            high[without] = np.maximum(high[without], own.bounds(radii).hi)
             if not without and inside:  # the derivatives over the piece contain those at its centre
-                at_centre = dataclasses.replace(gain, range=iv.entire(gain.range))
+                at_centre = dataclasses.replace(own, range=iv.entire(own.range))
                 still = [*known.radii, *(np.zeros(()) for _ in box)]
                 found = at_centre.bounds(still).lo
                 policy = np.where((found > low)[..., None], centre, policy)

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.enclosure import defect, games
+from hjbjax.enclosure.cell_functions import Cell
 from hjbjax.enclosure.interpolant import Spline, with_largest
-from hjbjax.enclosure.minimum import Cell
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import Array

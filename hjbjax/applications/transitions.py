@@ -334,7 +334,7 @@ def _jacobian(economy: _Economy, count: int, shift: float) -> np.ndarray:
         prices = np.full(count, price)
         prices[-1] += sign * shift
         players, rates = economy.backward(prices)
-        generators.append([laws.generator(_at(rates, n), grid) for n in range(count)])
+        generators.append([laws.sparse_generator(_at(rates, n), grid) for n in range(count)])
         direct.append(economy.excesses(prices, players, np.broadcast_to(law, (count, *law.shape))))
     # entries k = 0, ..., N − 1: the response k steps before the price
     flows = np.stack([(up - down).T @ law.ravel() for up, down in zip(*generators, strict=True)])[::-1] / (2 * shift)

@@ -74,7 +74,7 @@ class Series:
         lines = [f"{self.name:>9} {'value':>10} {'feedback':>10}  status"]
         rows = zip(self.parameters, self.errors, self.feedback_errors, self.fitted, self.solutions, strict=True)
         for parameter, value, feedback, counts, solution in rows:
-            # the mark concerns the value; the order of the feedback may use fewer entries
+            # for the fit of the value; the fit of the feedback may use fewer entries
             mark = " " if counts else "*"
             lines.append(f"{parameter:>9.4g} {value:>10.3e}{mark}{feedback:>10.3e}  {solution.status.name}")
         lines.append(f"{'order':>9} {self.order:>10.2f} {self.feedback_order:>10.2f}")

@@ -47,13 +47,13 @@ from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.finite_horizon import march
 
 MOST = 60  # Newton steps: a moderate change needs 3 to 8
-SHORTEST = 1 / 64  # of a Newton step
-SHIFT = 1e-3  # of the width of the bracket, for differences: the errors of the steps must not matter
-NEAR = 0.02  # of the change of the law: if more is left at the horizon, the horizon is too short
+SHORTEST = 1 / 64  # the shortest fraction of a Newton step
+SHIFT = 1e-3  # step of finite differences, as a fraction of the bracket; errors of the solves must not matter
+NEAR = 0.02  # if more than this fraction of the change of the law is left at the horizon, it is too short
 # fields of a solution that belong to the stationary problem
 STATIONARY = ("enclosure", "isaacs_gap", "grid_error", "box_error", "monotone_error", "cut", "stopping", "active")
 NODES = ("value", "policy", "disturbance")
-ROUNDING = 1e-6  # of probability, which equilibria with a tolerance may differ by
+ROUNDING = 1e-6  # difference of probabilities that two solves to the same tolerance may have
 MESSAGES = {
     Status.CONVERGED: "The market clears in every time step to the requested tolerance.",
     Status.STALLED: "No part of a Newton step decreases the excess. Begin with guess= from a smaller change, or use "

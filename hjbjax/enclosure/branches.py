@@ -20,15 +20,15 @@ from hjbjax.enclosure.discounted import DiscountTask, Kept, Move, sizes_of
 from hjbjax.enclosure.levels import Levels
 from hjbjax.problem.grid import Grid
 
-FAR = 0.1  # fraction of the range of V: a bound that is further away somewhere is compared with other candidates ...
-MORE = 3  # ... which take this many times the corrections
-STEP = 8  # cells: the mean and the spline round a kink over about seven
-RISE = 0.5  # fraction of the range of V by which a candidate is worse where it reads beyond an end
+FAR = 0.1  # more candidates are tried if a bound is off by this fraction of the range of V somewhere ...
+MORE = 3  # ... with this many times as many corrections
+STEP = 8  # cells; the mean and the spline smooth a kink over about seven
+RISE = 0.5  # a candidate loses this fraction of the range of V where it reads beyond an end
 LEVEL = 3.0  # the level of a correction is the shift divided by this number
-STAGNANT = 5  # corrections without progress after which no more are made ...
-FALLS = 0.9  # ... where a smaller largest defect, by this factor, is progress too
-PROGRESS = 0.1  # fraction of the wanted width, or of the shift over ten, by which a correction must narrow the bound
-REFRESHED = 4  # corrections with the same factors of their equations
+STAGNANT = 5  # stop after this number of corrections without progress ...
+FALLS = 0.9  # ... unless the largest defect fell by this factor
+PROGRESS = 0.1  # least gain of a correction, relative to the wanted width or to a tenth of the shift
+REFRESHED = 4  # corrections that share one factorisation
 
 
 def bound(

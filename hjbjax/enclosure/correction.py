@@ -22,8 +22,8 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 
-REACH = 2  # cells by which a source is widened, and then smoothed, so that its E is smooth on the grid
-SHARE = 40  # the cells of an axis over its reach on fine grids: otherwise E falls too steeply across the paths
+REACH = 2  # a source is widened and then smoothed over this number of cells, so that E is smooth on the grid
+SHARE = 40  # on fine grids the reach is this part of an axis, otherwise E falls too steeply across the paths
 MARGIN = 1.3  # a source is larger than the defect, because the chain spreads it
 MEAN = np.array([1, 3, 6, 7, 6, 3, 1]) / 27  # three means of three neighbours
 DIRECT = 2  # states up to which the linear equations are factored

@@ -24,9 +24,9 @@ from hjbjax.tracing import taylor_forms as tf
 from hjbjax.tracing.intervals import Interval
 from hjbjax.tracing.taylor_forms import Form
 
-RESPONSES = 3  # alternating best responses that find û and d̂ if G is not separable
+RESPONSES = 3  # rounds of best responses that find û and d̂ if G is not separable
 INSIDE = 1 - 1e-12  # a committed control is multiplied by this, so that rounding does not take it out of its ball
-Stopped = dict[frozenset[int], np.ndarray]  # sets of coordinates whose motion walls may stop, True where this matters
+Stopped = dict[frozenset[int], np.ndarray]  # coordinates whose motion walls may stop, with True where this matters
 Table = list[list[qu.Polynomial]]  # G for every listed control of one player, and every one of the other
 
 

@@ -196,7 +196,7 @@ def least_quadratic(b: Form, c: Form, lo: float, hi: float) -> tuple[Form, Inter
 
     def seconds(slope: Interval, curvature: Interval) -> tf.Curvature:
         inside, outside = (whole.lo > lo) & (whole.hi < hi), (whole.lo == whole.hi)
-        response = -(point(0.5) / curvature)  # of the minimiser to the slope, where it is inside
+        response = -(point(0.5) / curvature)  # the derivative of an inner minimiser with respect to the slope
         response = iv.where(inside, response, iv.union(response, zero))
         # without curvature the minimiser jumps from one end to the other
         response = iv.where(curvature.lo > 0, response, iv.entire(response))

@@ -34,8 +34,8 @@ from hjbjax.tracing.intervals import EPS, quietly
 from hjbjax.tracing.taylor_forms import Form
 
 UP = 1 + 1e-12  # more than the rounding of a few products and sums
-TRIALS = 100  # of the rise of the level in one time slab
-MORE = 1.01  # factor by which a trial exceeds the rise that the cells so far require
+TRIALS = 100  # guesses of the rise of the level in one time slab
+MORE = 1.01  # a guess exceeds the rise that the last one required by this factor
 
 
 def steady_drift(drift: Callable, z: Array, *inputs: Array) -> Array:

@@ -23,8 +23,8 @@ from hjbjax.tracing import closures
 from hjbjax.tracing.operations import operations
 from hjbjax.tracing.taylor_forms import traced
 
-FEWEST = 3  # times, for a parabola
-WIDER = 4  # times that the band of evaluated cells is doubled before a side is given up
+FEWEST = 3  # kept times, because coefficients beyond an end need three
+WIDER = 4  # largest number of times that the band of evaluated cells is doubled
 WORTH = 0.3  # a cell is bisected if its rate exceeds this fraction of the mean rate of the level
 
 

@@ -25,10 +25,10 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing.intervals import Interval, point
 
-BAD = 0.5  # relative defect from which on a cell is lifted out of the way of the others
+BAD = 0.5  # cells with at least this relative defect are lifted above the others
 LEAK = 0.01  # discount of the corrections, times the range of V over the least cost: keeps their equations regular
-LIMIT = 0.5  # larger relative defects count as this in a defect correction
-BLANK = 1e-5  # difference of a value from the exit cost that counts as none, relative to the range of V
+LIMIT = 0.5  # a defect correction clips relative defects to this
+BLANK = 1e-5  # values this close to the exit cost, relative to the range of V, are equal to it
 LIFT = 1.5  # height of a lifted cell, relative to the range of W
 HELD = 1e12  # rate of the nodes whose correction is prescribed, relative to the leak
 
@@ -113,7 +113,7 @@ class ExitTask(DiscountTask):
             if not kept:
                 required = correction.on_nodes(np.maximum(sizes, 0.0), self.grid, np.max)
             kept.append((values, levels))
-            # the coefficients instead of the spline, because this only judges the progress
+            # coefficients instead of values of the spline: this only measures the progress
             gap = np.minimum(sign * (base - levels.at(point(values))), best)
             stagnant = 0 if self.gains(gap, best) else stagnant + 1
             best = gap

@@ -41,7 +41,7 @@ from hjbjax.tracing.closures import OF_ACTION, OF_STATE, RATES, holds_tracers, o
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
 
-INTERVALS = 200  # of the output, by default
+INTERVALS = 200  # output intervals, by default
 MOST_INTERVALS = 10**7  # 80 MB per state
 
 _jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # overwrites the rows of all intervals in place

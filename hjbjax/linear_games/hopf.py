@@ -36,7 +36,7 @@ from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 
 LANES = 256  # the largest number of states that one compiled program computes together
-ENTRIES = 2_000_000  # of the matrices of all these states: 16 MB
+ENTRIES = 2_000_000  # entries of the matrices of all these states: 16 MB
 
 
 @front_door

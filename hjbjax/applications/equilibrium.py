@@ -145,8 +145,8 @@ def equilibrium(
       grid: the grid of its state.
       excess: a function of the price, the solution and its law that returns demand minus supply, a number, such as
         ``lambda r, solution, law: jnp.sum(law * wealth)``. The law has the shape of ``solution.value``.
-      bracket: two prices at which the excess has opposite signs, increasing. At both the problem needs a finite value
-        and a stationary law; an interest above the discount, for example, has none.
+      bracket: two prices at which the excess has opposite signs, increasing. The problem must have a finite value and a
+        stationary law at both prices. With an interest rate above the discount, for example, it has neither.
       tol: the largest error of the price, as a fraction of the width of the bracket.
       solve_tol: ``tol`` of each solve, in cost units.
       scheme: the chain of the value and of the law.

@@ -10,9 +10,9 @@ with a constant price p_n in each,
 Both steps are implicit and of first order in Δt, as in Achdou et al. (2022). The law stays non-negative with the same
 sum. The excess is evaluated at the end of each step, because a wealth Σ μ a responds to an interest only after a time.
 
-The N equations are solved by Newton steps with the Jacobian J at the new equilibrium, which N linear steps give: in a
-stationary economy the response to a price depends only on the time until it is paid. With 𝒱_k = ∂V_n/∂p_{n+k}, 𝒟_k the
-change of the law in the step n, and ℰ_j the mean excess of a unit mass j steps later,
+The N equations are solved by Newton steps with the Jacobian J at the new equilibrium. N linear steps give all of J,
+because in a stationary economy the response to a price depends only on the time until it is paid. With
+𝒱_k = ∂V_n/∂p_{n+k}, 𝒟_k the change of the law in the step n, and ℰ_j the mean excess of a unit mass j steps later,
 
     J[n, s] = J[n − 1, s − 1] + ℰ_n·𝒟_s,  plus  ∂E/∂p + ∂E/∂V·𝒱_{s−n}  for s ≥ n,
 
@@ -137,7 +137,7 @@ def transition(
       throw: raise if the prices are not found; otherwise ``status`` reports it.
 
     Returns:
-      The transition; host level only. A warning says if at the horizon the law is still far from that of ``after``.
+      The transition; host level only. Warns if the law at the horizon is still far from the law of ``after``.
 
     Raises:
       ValueError: an argument is invalid, or ``march`` or ``chain.generator`` refuses the problem.

@@ -35,7 +35,7 @@ Places = tuple[tuple[int, ...], ...]
 
 @pytree_dataclass(static=("rule", "bound", "states", "controls", "disturbances", "labels"), host=("problem",))
 class BlockSolution(files.Saved):
-    """The value of a problem that falls apart into blocks; made by ``Decomposition.solve`` and ``march``.
+    """The value of a problem that separates into blocks; made by ``Decomposition.solve`` and ``march``.
 
     Args:
       parts: the solutions of the blocks.

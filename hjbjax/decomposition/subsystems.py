@@ -1,4 +1,4 @@
-"""Blocks of states that do not see each other, and the problem of each block.
+"""Blocks of states that do not interact, and the problem of each block.
 
 A function of the problem is split into parts by ``separation``. The states that a part reads, together with all states
 that the drift of these states reads, form a self-contained subsystem; its controls and disturbances are those that its
@@ -98,7 +98,7 @@ def find_blocks(problem: Problem, n: int, *, bound: bool) -> Blocks:
       bound: True if subsystems may share inputs, so that the result may be a bound of V.
 
     Raises:
-      ValueError: the problem does not fall apart; the message names the coupling.
+      ValueError: the problem does not separate; the message names the coupling.
     """
     _check_ingredients(problem)
     m, k = (0 if each is None else each.dim for each in (problem.controls, problem.disturbances))
@@ -248,7 +248,7 @@ def _common(problem: Problem, names: Names) -> list[Inputs]:
 
 
 def _joined_groups(groups: Sequence[Group], common: Sequence[Inputs], *, share: bool) -> list[Group]:
-    """Groups joined if they share inputs, unless they may, or use inputs that a set couples."""
+    """Groups, joined if a set couples their inputs, or if they share inputs and ``bound`` does not allow it."""
     found: list[Group] = []
     for group in groups:
         inputs, keys = group
@@ -291,7 +291,7 @@ def _block(inputs: Inputs, keys: frozenset[Inputs], names: Names) -> Block:
 
 
 def _coupling(problem: Problem, reads: Sequence[Inputs], found: dict[str, Separated], names: Names, bound: bool) -> str:
-    """The message about a problem that does not fall apart."""
+    """The message about a problem that does not separate."""
     lines = [f"decompose: the {names.n} states are one block, so there is nothing to decompose:"]
     for i, each in enumerate(reads):
         others = frozenset(j for j in each if j < names.n and j != i)

@@ -115,8 +115,8 @@ class Interventions:
         """The nodes of every intervention, if V is ``value`` and not intervening is ``worth``; bool (*grid) each.
 
         Following the interventions of a node leads to a node without any, since no round trip is free. A push is
-        compared with V at the next node, if this is higher than its worth: if all nodes of a push region improve
-        without the push, each less than the next one, then all of them leave the region, not only the last one.
+        compared with V at the next node, or with the worth of that node if it is lower. Otherwise, if all nodes of a
+        push region would gain by not pushing, each less than the next one, only the last one would leave the region.
         """
         bounds = self.after(self.cheapest(jnp.maximum(worth, value) if self.pushes else worth))
         left = functools.reduce(jnp.minimum, bounds, worth) < worth

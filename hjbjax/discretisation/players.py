@@ -52,7 +52,7 @@ class Player:
       exact: True if the optimum is found exactly rather than by samples.
       driven: for every input the drift components that it drives.
       groups: the inputs, grouped by shared drift components and by products in the cost; H is a sum over the groups.
-        All inputs of a ball are one group if they are a program, and all inputs of a simplex always.
+        All inputs of a simplex are one group, and all inputs of a ball if their optimum needs quadratic programs.
       cells: for every group the number of pieces that the Hamiltonian may have.
       programs: for every group, True if its optimum is found by quadratic programs.
       curved: for every input, True if the cost may contain its square.

@@ -25,7 +25,8 @@ class Bound:
       coefficients: of every spline, each (*grid).
       levels: the function of every spline that is a bound.
       sign: 1 for a lower and −1 for an upper bound, before a change of sign.
-      caps: numbers per cell to which the bound is raised, and then lowered, (2, *cells); ``None`` without a target.
+      caps: the least and the largest bound in every cell, (2, *cells); a bound is first raised to the least one, and
+        then lowered to the largest one. ``None`` without a target.
       negated: True if minus this is the bound, for rewards.
     """
 
@@ -92,7 +93,7 @@ class Enclosure(files.Saved):
       upper: the upper bound at the nodes. Without a discount it may be infinite, and for rewards the lower one.
       status: CONVERGED if the mean width is at most ``tol`` times the range of V, otherwise MAX_STEPS. The bounds hold
         in both cases.
-      message: the problem that the bounds refer to, and their mean width.
+      message: the problem whose value is bounded, and the mean width of the bounds.
       stats: "seconds", "bytes" (the estimated memory) and "corrections".
       remaining: e^{−βT} at the nodes, shape (*grid), where T is a lower bound of the time until a path can meet a
         projected end. If the problem continues beyond the box, its value differs from the value between walls by at

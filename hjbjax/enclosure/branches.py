@@ -1,10 +1,10 @@
 """Bounds at kinks: the best of several candidates, each of which continues V across kinks from one side.
 
-Where two ways of acting are equally good V has a concave kink, and a differentiable upper bound cannot touch it. But
-there V is the least of differentiable functions, one for each way of acting. On the other side of the kink such a
+Where two ways of acting are equally good, V has a concave kink, which a differentiable upper bound cannot touch. But V
+is the least of two differentiable functions there, one for each way of acting. On the other side of the kink such a
 function is about the extrapolation 2 V(x − s) − V(x − 2s), if s is longer than the distance over which a spline rounds
-the kink off. The extrapolations along both directions of every axis are candidates. In a cell only those have to be
-bounds that are the best somewhere in it.
+the kink off. The extrapolations along both directions of every axis are candidates. A candidate has to be a bound only
+in cells where it is the best one somewhere.
 
 Each candidate is corrected along the paths of its control, since they leave the kink to one side.
 """
@@ -55,14 +55,15 @@ def bound(
 
 
 def _best(kept: Kept, sign: int) -> np.ndarray:
-    """The bound at the nodes, shape (*grid); of an upper bound the negative."""
+    """The bound at the nodes, shape (*grid), with its sign changed for an upper bound."""
     return np.max([sign * each - shift for each, shift in kept], axis=0)
 
 
 def extrapolations(values: np.ndarray, grid: Grid, sign: int) -> list[np.ndarray]:
     """The extrapolations of smooth values along both directions of every axis, shape (*grid) each.
 
-    Where one reads beyond an end of the box it is lowered (``sign`` 1, for lower bounds) or raised (−1).
+    Next to an end of the box, where an extrapolation would need V beyond the end, it is lowered (``sign`` 1, for lower
+    bounds) or raised (−1).
     """
     found = []
     for axis, cyclic in enumerate(grid.periodic):

@@ -30,8 +30,8 @@ class Functions:
       x: the state.
       radii: the largest distance from the centre along every axis.
       rate: the discount.
-      unit: the positive number by which a defect is divided: the discount, or without one a lower bound of the cost,
-        or one in a tube.
+      unit: the positive number by which a defect is divided: the discount; a lower bound of the running cost if there
+        is no discount; one for a tube.
       options: cost and drift as polynomials of the control, or for every action of a finite set; empty if they are not
         quadratic polynomials.
     """
@@ -102,7 +102,9 @@ def choices_of(admissible: Any) -> Sequence[int | np.ndarray]:
 def _cost_and_drift(
     problem: Problem, x: list[Form], inputs: Sequence[int | np.ndarray]
 ) -> tuple[qu.Polynomial, list[qu.Polynomial]]:
-    """Cost and drift as polynomials of the inputs, of which some players have numbers instead."""
+    """Cost and drift as polynomials of the inputs; ``inputs`` has the number of inputs, or a listed control, of every
+    player.
+    """
     if not any(isinstance(each, int) for each in inputs):
         actions = [[tf.constant(number) for number in np.asarray(each)] for each in inputs]
         forms = cost_form(problem, x, *actions), *tf.taylor_forms(problem.drift, x, *actions)
@@ -115,7 +117,7 @@ def _cost_and_drift(
 
 
 def _rate_and_unit(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> tuple[Form, Interval]:
-    """The discount, and the number by which a defect is divided, see ``Functions``."""
+    """The discount, and the number by which a defect is divided (see ``Functions``)."""
     (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
     if is_discounted(problem):  # an interval that contains zero makes the defect infinite
         return rate, rate.range

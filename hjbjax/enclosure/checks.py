@@ -22,7 +22,7 @@ def check_ingredients(caller: str, problem: Problem, others: Mapping[str, bool],
     Args:
       caller: the public function.
       problem: the problem.
-      others: ingredients that this function does not take, with True if the problem has them.
+      others: further ingredients that the caller refuses, with True if the problem has them.
       wanted: the end of the message.
 
     Raises:

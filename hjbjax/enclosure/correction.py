@@ -1,4 +1,4 @@
-"""Corrections of a candidate W by the defects that paths meet on their way.
+"""Corrections of a candidate W by the defects along the paths.
 
 Let E solve (β − L^π) E = β s, where L^π is the generator of the Markov chain under a policy π: the discounted mean of s
 along the path from each node. Subtracting E from W lowers the defect β W − H by about β s. Without a discount the right

@@ -122,7 +122,7 @@ def parts_of(grid: Grid, spline: Spline, index: Index, depth: int, stopped: Sequ
       spline: its cells.
       index: the number of each cell along every axis.
       depth: the number of bisections along every axis.
-      stopped: axes along which only the middle of a cell counts, which is a node.
+      stopped: axes along which a part is only the middle of its cell, which is a node.
     """
     ends = _parts(grid, _sides(index, spline), [depth] * grid.ndim, stopped)
     return spline.cells([np.repeat(i, 2 ** (depth * grid.ndim)) for i in index], ends)

@@ -155,8 +155,8 @@ class DiscountTask:
     def start(self, values: np.ndarray, found: Defects, sign: int) -> tuple[np.ndarray, Defects]:
         """The candidate, or a smoother one that requires a far smaller shift, and its defects.
 
-        H is concave in the slope, so a mean of W over nearby states is as good a lower bound as W, apart from the
-        variation of the problem over this distance. It rounds kinks off, around which the spline of V oscillates.
+        H is concave in the slope, so a mean of W over nearby states is about as good a lower bound as W. It smooths the
+        kinks, around which the spline of V oscillates.
         """
         for _ in range(SMOOTHER):
             smoother = self.continued(correction.mollified(values, self.grid))
@@ -169,7 +169,9 @@ class DiscountTask:
         return values, found
 
     def lead(self, values: np.ndarray, kept: Kept, sign: int) -> np.ndarray:
-        """The shift from which on a candidate is nowhere in a cell better than the bounds so far, shape (*cells)."""
+        """The least shift with which a candidate is not better than the bounds so far anywhere in a cell, shape
+        (*cells).
+        """
         found = np.full(self.spline.shape, np.inf)
         for other, shift in kept:
             found = np.minimum(found, (point(self.spline.largest(sign * (values - other))) + point(shift)).hi)
@@ -197,7 +199,7 @@ class DiscountTask:
         return max(options, key=lambda each: each[0])[1:]
 
     def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
-        """The defects with the cells that determine the shift cut into parts, at most a fraction of ``SHARE``."""
+        """The defects after the cells that determine the shift, at most a fraction ``SHARE``, are cut into parts."""
         for depth in range(1, BISECTIONS + 1):
             sizes = sizes_of(found, lead, sign)
             if not np.all(np.isfinite(sizes)):

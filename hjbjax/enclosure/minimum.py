@@ -65,7 +65,7 @@ def control_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDe
 def _by_formula(
     cell: Cell, stopped: Sequence[frozenset[int]], cost: qu.Polynomial, drift: list[qu.Polynomial]
 ) -> CellDefect:
-    """By the minimum of a quadratic polynomial of the control."""
+    """The defect from the formula for the minimum of a quadratic polynomial of the control."""
     known = cell.functions
 
     def defect(without: frozenset[int]) -> tuple[Interval, Actions, list[np.ndarray]]:
@@ -150,7 +150,7 @@ def _common(squares: Sequence[Form | None]) -> Form:
 
 
 def norm(b: Sequence[Form]) -> Form:
-    """The Euclidean norm; the derivative where it may be zero is that of all directions."""
+    """The Euclidean norm. Where it may be zero, its derivative is the range over all directions."""
 
     def function(*ranges: Interval) -> Interval:
         total = iv.squared(ranges[0])
@@ -211,7 +211,7 @@ def least_quadratic(b: Form, c: Form, lo: float, hi: float) -> tuple[Form, Inter
 
 
 def _middle(u: Interval, lo: float, hi: float) -> np.ndarray:
-    """A number between the ends of an interval and between two numbers."""
+    """The middle of an interval, moved into [lo, hi]."""
     return np.clip(np.nan_to_num((u.lo + u.hi) / 2), lo, hi)
 
 
@@ -254,7 +254,7 @@ def minimisers(slope: Interval, curvature: Interval, lo: float, hi: float) -> In
 
 
 def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
-    """By enumeration of a finite set."""
+    """The defect from an enumeration of a finite set."""
     known = cell.functions
     costs: dict[frozenset[int], list[Form]] = {each: [] for each in (frozenset[int](), *stopped)}
     for paid, drift in known.options:
@@ -271,7 +271,7 @@ def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
 
 
 def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
-    """By cutting the set into pieces: the control is one more coordinate of each box."""
+    """The defect from pieces of the set of controls: the control is one more coordinate of each box."""
     known = cell.functions
     problem, n, whole = known.problem, len(known.x), known.rate * cell.w
     high = {each: np.asarray(-np.inf) for each in (frozenset[int](), *stopped)}

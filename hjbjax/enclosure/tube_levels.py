@@ -1,4 +1,4 @@
-"""The conditions of the cells of time and space on the levels that bound a marched tube.
+"""Conditions on the levels that bound a marched tube, for every cell of time and space.
 
 Let W(t, x) be a spline in time and space near the value of
 
@@ -255,7 +255,7 @@ def _either(join: Callable[[Form, Form], Form], left: Form | None, right: Form |
 
 
 def _parts(index: Sequence[np.ndarray], bisections: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
-    """The numbers of some cells in parts of one block each, if every cell is bisected this number of times."""
+    """The numbers of some cells, in blocks that are small enough if every cell is bisected this number of times."""
     step = max(1, defect.BLOCK >> bisections)
     for first in range(0, len(index[0]), step):
         yield tuple(each[first : first + step] for each in index)
@@ -291,7 +291,7 @@ def spline_coefficients(values: np.ndarray, mesh: Grid) -> np.ndarray:
 
 
 def _extended(rows: np.ndarray, cyclic: bool) -> np.ndarray:
-    """The coefficients along the first axis with their continuation: periodic by two more, or by a parabola."""
+    """The coefficients along the first axis and beyond its ends: periodic, or along a parabola."""
     if cyclic:
         return np.concatenate([rows[-1:], rows, rows[:2]])
     ghosts = [3 * (rows[a] - rows[b]) + rows[c] for a, b, c in ((0, 1, 2), (-1, -2, -3))]

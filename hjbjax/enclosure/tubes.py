@@ -43,7 +43,7 @@ class TubeEnclosure:
       stats: "seconds", "bytes" (the estimated memory), "cells" and "bisected", the numbers of evaluated and of bisected
         cells.
       spline: the cells of W in (t, x).
-      coefficients: of W at the first times, which determine W at t = 0.
+      coefficients: the coefficients of W at the first times, which determine W at t = 0.
       thresholds: W ≥ the first one proves V > v, or V ≥ v for ``avoid``, and −W ≥ the second one V ≤ v, or V < v.
       above: True for ``avoid``.
     """
@@ -96,11 +96,11 @@ def enclose_tube(
     """An inner and an outer set of a tube, with proof: neither the grid nor rounding is neglected.
 
     A spline W in time and space has the defect −W_t − H(x, DW). Let σ(t) be a level of W that changes at the rate of
-    the largest defect of the cells that it meets. Then {W(0) ≥ σ(0)} belongs to {V ≥ v}, where v is σ at the horizon up
-    to the errors of W there and at the obstacles. The same holds from the other side.
+    the largest defect of the cells that it meets. Then {W(0) ≥ σ(0)} is inside {V ≥ v}, where v is the level σ at the
+    horizon, apart from the errors of W there and at the obstacles. The same holds from the other side.
 
     Args:
-      problem: a problem of ``reach``, ``avoid`` or ``reach_avoid``, or another one without running cost, discount,
+      problem: a problem of ``reach``, ``avoid`` or ``reach_avoid``, or another problem without running cost, discount,
         noise, jumps and modes. Drift and distances must be Lipschitz functions that are defined on the whole box. In a
         game the drift must be a quadratic polynomial of the inputs, or the sets finite.
       solution: a solution of this problem by ``march`` with equally spaced ``times`` from zero to the horizon. The sets

@@ -191,8 +191,8 @@ def perturbation_study(
     if clock.interrupted:
         came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
         raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
-    # the worst case is strongest at the lowest level: if it does not reach its bound, no other does; the region need
-    # not be a box, so the disturbance is masked outside it and inner=1
+    # The worst case is strongest at the lowest level: if it does not reach its bound, no other does. The region need
+    # not be a box, so the disturbance is masked outside it, with inner=1.
     watched = dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask))
     felt = saturation(watched, games[-1], inner=1.0)
     if felt.share > 0:

@@ -44,8 +44,8 @@ class Fit(files.Saved):
     """The result of ``fit``.
 
     Args:
-      parameters: the best parameters, of the structure of the initial ones, in NumPy. After ``Fit.load`` a dictionary
-        from the place of each array, such as "['mass']", to the array, because a file holds no classes.
+      parameters: the best parameters, of the structure of the initial ones, in NumPy. After ``Fit.load`` they are a
+        dictionary of arrays by name, such as "['mass']", because a file does not store classes.
       loss: the loss at these parameters.
       history: the loss before every step of the best run, shape (k,).
       status: CONVERGED, MAX_STEPS, NONFINITE, INTERRUPTED or TIME_LIMIT.

@@ -221,8 +221,8 @@ def evolve(
       scheme: the chain that defines the rates.
 
     Returns:
-      The laws, shape (number of times, *grid); in NumPy at host level. Inside ``jit`` and ``vmap`` they are traced, and
-      forward derivatives, as of ``jax.jvp`` and ``jax.jacfwd``, pass. ``horizon`` and all times must be known numbers.
+      The laws, shape (number of times, *grid); in NumPy at host level. Inside ``jit`` and ``vmap`` they are traced.
+      They have forward derivatives (``jax.jvp`` and ``jax.jacfwd``). ``horizon`` and all times must be known numbers.
       The result is NaN there if ``generator`` would raise.
 
     Raises:

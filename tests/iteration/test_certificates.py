@@ -23,14 +23,9 @@ from hjbjax.problem.pytree import cast
 from hjbjax.problem.sets import Finite
 from hjbjax.solution.solution import Solution
 
+pytestmark = pytest.mark.usefixtures("float64")
 POINTS = np.array([[-1.0], [0.0], [0.4], [1.0]])
 laws = settings(max_examples=10)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 @functools.partial(jax.jit, static_argnames="kind")

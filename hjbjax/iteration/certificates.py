@@ -190,7 +190,7 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     priced = layout.largest(jnp.asarray(free & ~costs, value.dtype)) == 0
     sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # where V is flat, r = L up to rounding
     below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
-    if obstacles.interventions.pushes:  # scaling V scales c + V(x + o) the right way only for c ≥ 0
+    if obstacles.interventions.pushes:  # the bound for scaled V requires c ≥ 0
         least_push = functools.reduce(jnp.minimum, map(jnp.min, obstacles.interventions.costs))
         sound, priced = sound & (least_push >= 0), priced & (least_push >= 0)
     lift = jnp.maximum(-lowest_end(obstacles, counted, layout), 0)

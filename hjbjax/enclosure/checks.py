@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_random
 from hjbjax.problem.pytree import is_traced
 from hjbjax.solution.solution import Solution
@@ -16,17 +17,22 @@ def check_types(caller: str, problem: Problem, solution: Solution) -> None:
         raise ValueError(f"{caller}: got traced numbers; call it outside of jit, vmap and grad")
 
 
-def check_ingredients(caller: str, problem: Problem, others: Mapping[str, bool], wanted: str) -> None:
-    """Refuse a problem with an ingredient for which there is no proof.
+def check_ingredients(
+    caller: str, problem: Problem, grid: Grid, others: Mapping[str, bool], wanted: str, advice: str = ""
+) -> None:
+    """Refuse a problem with an ingredient, or a grid with ends, for which there is no proof.
 
     Args:
       caller: the public function.
       problem: the problem.
+      grid: its grid.
       others: further ingredients that the caller refuses, with True if the problem has them.
-      wanted: the end of the message.
+      wanted: the end of the message about an ingredient.
+      advice: the end of the message about the ends.
 
     Raises:
-      ValueError: the problem has one of these ingredients, random paths, modes, pushes or growth.
+      ValueError: the problem has one of these ingredients, random paths, modes, pushes or growth; or an end of the
+        grid is neither projected nor periodic.
     """
     lacking = {
         "random paths (noise, jumps or modes)": is_random(problem), "modes": problem.modes is not None,
@@ -34,10 +40,6 @@ def check_ingredients(caller: str, problem: Problem, others: Mapping[str, bool],
     }  # fmt: skip
     if found := [name for name, is_there in lacking.items() if is_there]:
         raise ValueError(f"{caller}: got {' and '.join(found)}; wanted {wanted}")
-
-
-def check_ends(caller: str, solution: Solution, advice: str) -> None:
-    """Refuse a grid with ends that are neither projected nor periodic."""
-    kinds = sorted({kind for pair in solution.grid.edges if pair for kind in pair if kind != "projected"})
+    kinds = sorted({kind for pair in grid.edges if pair for kind in pair if kind != "projected"})
     if kinds:
         raise ValueError(f"{caller}: got {' and '.join(kinds)} ends; wanted projected ends or periodic axes{advice}")

@@ -151,7 +151,7 @@ def defects(spline: Spline, known: Sequence[CellBlock], values: np.ndarray, befo
     for block in known:
         total.low[block.index], total.high[block.index] = np.inf, -np.inf
     for block in known:
-        found, policy = over_block(block, values)
+        found, policy = over_block(block, *block.cells.scalars(values))
         low, high = found.ends
         if block.ended is not None:
             low, high = np.where(block.ended, np.inf, low), np.where(block.ended, -np.inf, high)
@@ -186,18 +186,14 @@ def _parts(
     return found
 
 
-def over_block(block: CellBlock, values: np.ndarray) -> tuple[Interval, np.ndarray]:
+def over_block(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:
     """Bounds of (β W − H)/β over parts of some cells, and a control; without a discount −H over the least cost.
 
     Args:
       block: the parts.
-      values: the coefficients of W.
+      w: W over these parts.
+      p: its gradient.
     """
-    return over_forms(block, *block.cells.scalars(values))
-
-
-def over_forms(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:
-    """The same for W and its gradient over these parts."""
     if block.known.problem.is_game:
         return _over_block_of_game(block, w, p)
     every = frozenset(block.walls)
@@ -212,7 +208,7 @@ def over_forms(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.n
         low = (point(low) - loss).lo
     if every:
         high = np.where(rises, np.maximum(high, found.least[every]), high)
-    return _per_unit(low, high, found.unit), found.policy
+    return _per_unit(low, high, block.known.unit), found.policy
 
 
 def _over_block_of_game(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:

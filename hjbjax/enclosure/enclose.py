@@ -137,11 +137,10 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
         "with a discount or with a target. Bounds on the true value are proved only for these problems;\n"
         "Solution.grid_error and box_error are estimates for the others"
     )
-    checks.check_ingredients("enclose", problem, others, wanted)
     advice = (
         ". Solve on a larger box\nwith edges='projected': the bounds are those of the problem with walls at its ends"
     )
-    checks.check_ends("enclose", solution, advice)
+    checks.check_ingredients("enclose", problem, grid, others, wanted, advice)
     value = np.asarray(costs.value, float)
     if problem.target is not None and value.shape == grid.shape and np.any(np.isfinite(value)):
         value = correction.nearest_known(value, np.isfinite(value), grid)  # infinite where no path meets the target

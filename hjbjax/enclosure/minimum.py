@@ -34,14 +34,12 @@ class CellDefect:
 
     Attributes:
       defect: the range of β W − H.
-      unit: the positive number by which the defect is divided.
       least: for each set of coordinates that a wall stops, an upper bound of β W − H without their motion.
       drift: the range of every component of the drift under the minimisers.
       policy: a control near the minimiser at the centre, shape (count, m); proves nothing.
     """
 
     defect: Interval
-    unit: Interval
     least: dict[frozenset[int], np.ndarray]
     drift: list[Interval]
     policy: np.ndarray
@@ -74,7 +72,7 @@ def _by_formula(
 
     found, actions, near = defect(frozenset())
     speeds = [range_over(component, actions) for component in drift] if stopped else []
-    return CellDefect(found, known.unit, {each: defect(each)[0].hi for each in stopped}, speeds, _stacked(near, cell))
+    return CellDefect(found, {each: defect(each)[0].hi for each in stopped}, speeds, _stacked(near, cell))
 
 
 def _stacked(inputs: Sequence[np.ndarray], cell: Cell) -> np.ndarray:
@@ -265,9 +263,7 @@ def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
     best = np.argmin(np.stack(np.broadcast_arrays(*gains)), axis=0)
     bounds = {without: (whole - tf.minimum(*found)).bounds(known.radii) for without, found in costs.items()}
     speeds = [iv.union(*(drift[k][()].range for _, drift in known.options)) for k in range(len(cell.p))]
-    return CellDefect(
-        bounds[frozenset()], known.unit, {each: bounds[each].hi for each in stopped}, speeds, points[best]
-    )
+    return CellDefect(bounds[frozenset()], {each: bounds[each].hi for each in stopped}, speeds, points[best])
 
 
 def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
@@ -297,7 +293,7 @@ def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
                 low = np.maximum(low, found)
         speeds.append([each.range for each in drift])
     return CellDefect(
-        Interval(low, high[frozenset()]), known.unit, {each: high[each] for each in stopped},
+        Interval(low, high[frozenset()]), {each: high[each] for each in stopped},
         [iv.union(*each) for each in zip(*speeds, strict=True)], policy,
     )  # fmt: skip
 

@@ -263,7 +263,7 @@ def _parts(index: Sequence[np.ndarray], bisections: int = 0) -> Iterator[tuple[n
 
 def _rates(block: defect.CellBlock, w: Form, p: list[Form]) -> tuple[np.ndarray, np.ndarray]:
     """Upper bounds of −W_t − H and of W_t + H over parts of some cells."""
-    rate, _ = defect.over_forms(block, w, p)
+    rate, _ = defect.over_block(block, w, p)
     narrow = None if block.walls else games.by_vertices(Cell(block.known, w, p))
     if narrow is not None:
         rate = iv.meet(rate, narrow)

@@ -232,8 +232,7 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
         "a march from other values than the terminal cost": bool(solution.stats.get("start")),
     }  # fmt: skip
     wanted = "a problem of reach, avoid or reach_avoid.\nSets are proved only for these problems"
-    checks.check_ingredients("enclose_tube", problem, others, wanted)
-    checks.check_ends("enclose_tube", solution, "")
+    checks.check_ingredients("enclose_tube", problem, grid, others, wanted)
     horizon = float(solution.stats.get("horizon", np.nan)) if solution.times is not None else np.nan
     times = np.asarray([] if solution.times is None else solution.times, float)
     even = len(times) >= FEWEST and np.allclose(

@@ -171,7 +171,7 @@ def piecewise_pair(
     if len(cells) > UNROLLED:
         corner = clipped([lo[0], lo[1]])
         best: Candidate = corner, jnp.asarray(total(corner))
-        # as on a side: a gain that is constant along its own line is harmless, and all lines share one computation
+        # one computation for all lines, including the line of the gain itself, along which this gain is constant
         lines = [_kink_line(piece, kink) for piece in pieces for kink in piece.kinks]
         sides += [(tuple(point), tuple(way), _within(point, way, lo, hi)) for point, way in lines]
         for candidate, entries in ((on_side, sides), (in_cell, cells)):

@@ -2,8 +2,8 @@
 
 The jaxpr of a function is evaluated with *separated* scalars: numbers with the set of the inputs on which each depends.
 A sum keeps one number per set of inputs, and so do a maximum and a minimum. Every other operation first joins its
-operands into one number that depends on all their inputs. A negative factor turns a maximum into a minimum. Only
-factors in the code have a known sign, because numbers in the leaves of a function may change.
+operands into one number that depends on all their inputs. Numbers in the leaves of a function may change, so only
+factors in the code have a known sign, which decides whether a maximum stays one.
 """
 
 from __future__ import annotations

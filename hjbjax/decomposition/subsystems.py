@@ -98,7 +98,7 @@ def find_blocks(problem: Problem, n: int, *, bound: bool) -> Blocks:
       bound: True if subsystems may share inputs, so that the result may be a bound of V.
 
     Raises:
-      ValueError: the problem does not separate; the message names the coupling.
+      ValueError: the problem does not fall apart; the message names the coupling.
     """
     _check_ingredients(problem)
     m, k = (0 if each is None else each.dim for each in (problem.controls, problem.disturbances))
@@ -248,7 +248,7 @@ def _common(problem: Problem, names: Names) -> list[Inputs]:
 
 
 def _joined_groups(groups: Sequence[Group], common: Sequence[Inputs], *, share: bool) -> list[Group]:
-    """Groups, joined if a set couples their inputs, or if they share inputs and ``bound`` does not allow it."""
+    """Groups joined if they share inputs, unless they may, or use inputs that a set couples."""
     found: list[Group] = []
     for group in groups:
         inputs, keys = group

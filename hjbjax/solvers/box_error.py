@@ -18,18 +18,16 @@ only with the other ends, such as leaving where the control stands still at a wa
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import edges, stencil
+from hjbjax.discretisation import edges
 from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.discretisation.landing import Landing
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Obstacles
-from hjbjax.iteration.evaluation import factor_and_solve
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
@@ -38,15 +36,12 @@ from hjbjax.problem.types import Field, Nodes
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import warn
-from hjbjax.solvers import nested_grids
-from hjbjax.solvers.coarse_levels import on_coarser
+from hjbjax.solvers import factored_level, nested_grids
+from hjbjax.solvers.factored_level import Rows
 from hjbjax.solvers.result import least_and_most, warn_of_cuts
 from hjbjax.solvers.settle import Settled
 
-SHARE, FEWEST, MOST = 16, 600, 3000  # nodes of the coarse grid: one in 16, within these limits
 MARCHED = 20_000  # largest coarse grid of marches for the box error only
-FACTORED = 12_000  # largest grid that is factored if a coarser one would lose the target
-INTERVALS = 6  # least number of intervals per axis
 STEPS = 30  # largest number of Newton steps; most problems take two or three
 SETTLED = 0.05  # the iteration ends with a step below this fraction of the change so far
 FARTHEST = 100  # in units of the range of V: a larger change means that the other equation has no solution near V
@@ -106,7 +101,7 @@ def of_solve(task: Task, value: Nodes) -> BoxError:
     """
     if other_ends(task.problem, task.grid) == task.grid.edges:
         return BoxError(None, CANNOT_MATTER)
-    level = _coarse_task(task)
+    level = factored_level.small_enough(task)
     if level is None:
         return BoxError(None, TOO_MANY)
     finite = np.where(np.isfinite(value), value, np.max(value[np.isfinite(value)], initial=0))
@@ -116,9 +111,9 @@ def of_solve(task: Task, value: Nodes) -> BoxError:
 
 def coarse_for_marches(grid: Grid) -> Grid | None:
     """The coarse grid for two marches of which only the difference matters; None if none is small enough."""
-    wanted = int(np.clip(grid.size // SHARE, FEWEST, MARCHED))
+    wanted = int(np.clip(grid.size // factored_level.SHARE, factored_level.FEWEST, MARCHED))
     coarse = grid
-    while coarse.size > wanted and (smaller := nested_grids.coarser(coarse, INTERVALS)) is not None:
+    while coarse.size > wanted and (smaller := nested_grids.coarser(coarse, factored_level.INTERVALS)) is not None:
         coarse = smaller
     return coarse if coarse.size <= max(wanted, MARCHED) else None
 
@@ -168,34 +163,11 @@ def _other_free_ends(level: Task) -> tuple:
     return tuple(found)
 
 
-def _coarse_task(task: Task) -> Task | None:
-    """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
-    level = dataclasses.replace(task, on=task.on.chain)
-    grids = _coarser_grids(task.grid, int(np.clip(task.grid.size // SHARE, FEWEST, MOST)))
-    while grids:
-        coarse = on_coarser(level, grids.pop())
-        if coarse is not None:
-            level = coarse
-            break
-    fits = level.grid.size <= FACTORED and level.grid.ndim < 6
-    return dataclasses.replace(level, mesh=None) if fits else None
-
-
-def _coarser_grids(grid: Grid, wanted: int) -> list[Grid]:
-    """Ever coarser grids; the number of nodes of the last is closest to ``wanted``, as a ratio."""
-    grids = [grid]
-    while grids[-1].size > wanted and (coarse := nested_grids.coarser(grids[-1], INTERVALS)) is not None:
-        if coarse.size * grids[-1].size < wanted**2:
-            break
-        grids.append(coarse)
-    return grids[1:]
-
-
 def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     """|W − V| on the grid ``fine``, from V on a coarse one."""
     grid = altered(level.grid, edges=_other_free_ends(level))
     others = level.on.on_grid(grid)
-    restricted, policy = _defect(level, jnp.asarray(before, level.tol.dtype))
+    restricted, policy = factored_level.policy_at(level, jnp.asarray(before, level.tol.dtype))
     start, defect = jax.device_get((restricted, policy.defect))
     obstacles = _fixed_next_to_lost(level)
     value, scale = start, np.ptp(counted := start[np.asarray(level.counted)])
@@ -203,12 +175,12 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
         return BoxError(None, FLAT)
     moved = np.zeros(grid.shape, bool)
     for step in range(STEPS):
-        source, weights, landings = jax.device_get(_equation(others, value, obstacles, defect))
+        rows = _equation(others, value, obstacles, defect)
         if step == 0:
-            moved = np.abs(source) > ROUNDING * scale
+            moved = np.abs(np.asarray(rows.source)) > ROUNDING * scale
             if not np.any(moved):
                 return BoxError(None, NEVER_REACHED)
-        delta = factor_and_solve(list(weights), list(weights.values()), source, grid, landings=landings)
+        delta = rows.solved(grid)
         value, largest = value + delta, np.max(np.abs(delta))
         change = np.abs(value - start)
         if not np.isfinite(largest) or np.max(change) > FARTHEST * scale:
@@ -220,29 +192,11 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
 
 
 @jax.jit
-def _defect(task: Task, value: Field) -> tuple[Field, bellman.Greedy]:
-    """V with prescribed values inserted, and its policy with the defect of V where actions matter.
-
-    The actions are results too, because XLA would otherwise recompute them in every branch of the defect.
-    """
-    value = task.impose(value)
-    policy = bellman.greedy(task.on, value, task.obstacles.fixed, lost=task.lost)
-    return value, dataclasses.replace(policy, defect=jnp.where(task.obstacles.acting(value), policy.defect, 0))
-
-
-@jax.jit
-def _equation(
-    on: Discretisation, value: Field, obstacles: Obstacles, defect: Field
-) -> tuple[Field, dict, tuple[Landing, ...]]:
-    """The right-hand side and the weights of Newton's equation for G(W) = F(V), F(V) being the ``defect``."""
+def _equation(on: Discretisation, value: Field, obstacles: Obstacles, defect: Field) -> Rows:
+    """Newton's equation for G(W) = F(V), F(V) being the ``defect``."""
     policy = bellman.greedy(on, value, obstacles.fixed)
     policy = dataclasses.replace(policy, defect=policy.defect - jnp.where(obstacles.fixed, 0, defect))
-    equation = bellman.policy_equation(on, value, policy, obstacles)
-    offsets, entries = stencil.inward(equation.weights.offsets, equation.weights.values, on.grid)
-    weights: dict[tuple[int, ...], Any] = {}
-    for offset, entry in zip(offsets, entries, strict=True):
-        weights[offset] = weights[offset] + entry if offset in weights else entry
-    return equation.source, weights, equation.weights.landings
+    return factored_level.rows_of(bellman.policy_equation(on, value, policy, obstacles), on.grid)
 
 
 def _is_flat(value: np.ndarray) -> bool:

@@ -215,6 +215,19 @@ def restrict(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
     return values
 
 
+def mean_around(values: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
+    """The mean of the node values of the finer grid over those closest to each node of the coarser one, (*coarse)."""
+    for axis, count in enumerate(coarse.shape):
+        many, few = fine.intervals(axis), coarse.intervals(axis)
+        nearest = np.rint(np.arange(fine.shape[axis]) * (few / many)).astype(int) % count
+        along = np.moveaxis(values, axis, 0)
+        total = np.zeros((count, *along.shape[1:]), values.dtype)
+        np.add.at(total, nearest, along)
+        shape = (-1,) + (1,) * (along.ndim - 1)
+        values = np.moveaxis(total / np.bincount(nearest, minlength=count).reshape(shape), 0, axis)
+    return values
+
+
 def apart(value: np.ndarray, other: np.ndarray) -> np.ndarray:
     """|value − other|, zero where it is not finite."""
     with np.errstate(invalid="ignore"):

@@ -28,6 +28,7 @@ from hjbjax.solvers.arrival import warn_of_no_arrival
 from hjbjax.solvers.coarse_levels import CoarserAnswer
 from hjbjax.solvers.coarser_answer import SHARE, remaining_error
 from hjbjax.solvers.contact import contact_of_solve
+from hjbjax.solvers.discontinuities import error_at_discontinuities
 from hjbjax.solvers.rest_error import error_at_rest
 from hjbjax.solvers.settle import Settled
 from hjbjax.solvers.setup import BOUNDING, Assumptions
@@ -146,6 +147,8 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer
         highest=_highest(settled),
     )
     error = np.maximum(grid_error.estimate_error(answers), value.dtype.type(error_at_rest(solution, settled.task)))
+    missed = error_at_discontinuities(solution, settled.task)
+    error = error if missed is None else np.maximum(error, missed.astype(value.dtype))
     error += _left(solution, settled, error)
     error[~np.isfinite(value)] = 0
     warn_of_grid(error[None], value[None])

@@ -138,8 +138,8 @@ def fit(
         the initial ones. The best run counts.
       seed: of the random numbers of restarts and of the check.
       check_gradient: compare the gradient at the initial parameters with a finite difference, and warn if they differ.
-      tol: a run has converged if, over the last tenth of its steps (at least ten), the loss changed by less than this
-        fraction of its whole decrease. It ends early below a thousandth of this fraction.
+      tol: a run has converged if the loss changed by less than this fraction of its whole decrease over the last tenth
+        of the steps, and at least ten. It ends early below a thousandth of this fraction.
       time_limit: seconds, including compilation.
       progress: show a bar of the steps after a second; ``None``: on a terminal.
 

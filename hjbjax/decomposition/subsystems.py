@@ -291,7 +291,7 @@ def _block(inputs: Inputs, keys: frozenset[Inputs], names: Names) -> Block:
 
 
 def _coupling(problem: Problem, reads: Sequence[Inputs], found: dict[str, Separated], names: Names, bound: bool) -> str:
-    """The message about a problem that does not separate."""
+    """The message about a problem that does not fall apart."""
     lines = [f"decompose: the {names.n} states are one block, so there is nothing to decompose:"]
     for i, each in enumerate(reads):
         others = frozenset(j for j in each if j < names.n and j != i)

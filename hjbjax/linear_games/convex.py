@@ -124,7 +124,7 @@ class Quadratic(_WithoutBarrier):
 
 
 @pytree_dataclass(static=("dim",))
-class Differentiable(_WithoutBarrier):
+class Smooth(_WithoutBarrier):
     """A differentiable function that its user declares convex; made by ``smooth``.
 
     Args:
@@ -180,7 +180,7 @@ class Conjugated(_WithoutBarrier):
         return jax.hessian(lambda p: jnp.asarray(self.transform(p), theta.dtype))(theta)
 
 
-ConvexFunction: TypeAlias = Largest | Quadratic | Differentiable | Conjugated
+ConvexFunction: TypeAlias = Largest | Quadratic | Smooth | Conjugated
 
 
 def ball(center: Numbers | Sequence, radius: Number) -> Largest:
@@ -278,7 +278,7 @@ def largest(functions: Sequence[Largest]) -> Largest:
     )
 
 
-def smooth(function: Callable, states: int, *, conjugate: Callable | None = None) -> Differentiable | Conjugated:
+def smooth(function: Callable, states: int, *, conjugate: Callable | None = None) -> Smooth | Conjugated:
     """Declare that a function is convex, and differentiable unless its Legendre transform is given.
 
     The bounds of ``hopf`` are wrong if the declaration is.
@@ -296,7 +296,7 @@ def smooth(function: Callable, states: int, *, conjugate: Callable | None = None
     """
     own = as_partial(function, "convex.smooth: function")
     if conjugate is None:
-        return Differentiable(int(states), own)
+        return Smooth(int(states), own)
     found = Conjugated(int(states), own, as_partial(conjugate, "convex.smooth: conjugate"))
     if not is_traced(found):
         _check_transform(found)

@@ -15,7 +15,7 @@
 #
 # Two vehicles move along perpendicular roads. Each has a position, a velocity and a motor that answers with a delay.
 # Both must be near the crossing at the same time. On one grid with 25 nodes per axis this is 244 million nodes.
-# The vehicles do not see each other, so `hjb.decompose` solves two grids of 15,625 nodes.
+# The vehicles do not interact, so `hjb.decompose` solves two grids of 15,625 nodes.
 
 # %%
 import jax.numpy as jnp

@@ -126,3 +126,10 @@ def _room_for_code():
     if maps.exists() and maps.read_bytes().count(b"\n") > MAPS:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(scope="module")
+def float64():
+    """The precision of a solve, for tests of its parts."""
+    with jax.enable_x64(True):
+        yield

@@ -295,11 +295,11 @@ def _sort(grids: Sequence[Grid] | Grid) -> tuple[Grid, ...]:
             raise TypeError(f"convergence_study: got {grid!r} among the grids, wanted Grid objects")
     if len(grids) < 2:
         raise ValueError(f"convergence_study: got {len(grids)} grid, wanted at least two to see an order")
-    # by the geometric mean of the spacings, so that the units of the axes do not matter
+    # the geometric mean of the spacings, so that the units of the axes do not matter
     first, *rest = ordered = sorted(grids, key=mean_spacing, reverse=True)
     for grid in rest:
         check_same_box("grids of different boxes", first, grid)
-        if repr(grid.stretch) != repr(first.stretch):  # by text, because stretch functions compare by identity
+        if repr(grid.stretch) != repr(first.stretch):  # compare the text, because stretch functions compare by identity
             raise ValueError(f"convergence_study: got stretch {first.stretch} and {grid.stretch}; wanted one for all")
         ratios = mean_spacings(first) / mean_spacings(grid)  # (n,), the refinement factor along every axis
         # intervals are integers, so allow an odd axis to deviate by 10 %

@@ -145,8 +145,8 @@ def equilibrium(
       grid: the grid of its state.
       excess: a function of the price, the solution and its law that returns demand minus supply, a number, such as
         ``lambda r, solution, law: jnp.sum(law * wealth)``. The law has the shape of ``solution.value``.
-      bracket: two prices at which the excess has opposite signs, increasing. At both the problem needs a finite value
-        and a stationary law; an interest above the discount, for example, has none.
+      bracket: two prices at which the excess has opposite signs, increasing. The problem must have a finite value and a
+        stationary law at both prices. With an interest rate above the discount, for example, it has neither.
       tol: the largest error of the price, as a fraction of the width of the bracket.
       solve_tol: ``tol`` of each solve, in cost units.
       scheme: the chain of the value and of the law.
@@ -253,7 +253,7 @@ def _on_host(economy: _Economy, lo: float, hi: float, tol: float) -> Equilibrium
             f"equilibrium: the excess is {at_lo:.6g} at the price {lo:.6g} and {at_hi:.6g} at {hi:.6g}; wanted "
             "opposite signs,\nso that a root lies between. Move an end of the bracket; excess is demand minus supply"
         )
-    search, width = root_search.start(lo, at_lo, hi, at_hi), tol * (hi - lo)
+    search, width = root_search.begin_search(lo, at_lo, hi, at_hi), tol * (hi - lo)
     while not root_search.is_done(search, width) and len(found) < MOST:
         price = float(root_search.proposal(search))
         search = root_search.narrowed(search, price, evaluate(price), width)
@@ -315,7 +315,7 @@ def _search(of_price: Callable, ends: Any, tol: Any, nothing: Any) -> tuple[Any,
         # both ends first, in the same loop, because each place that solves takes seconds to compile
         price = jnp.where(count == 0, lo, jnp.where(count == 1, hi, root_search.proposal(search)))
         excess, found = of_price(price, value)
-        begun = root_search.start(lo, search.f_far, hi, excess)
+        begun = root_search.begin_search(lo, search.f_far, hi, excess)
         first = search._replace(f_far=excess)
         later = root_search.narrowed(search, price, excess, width)
         search = jax.tree.map(

@@ -21,7 +21,7 @@ from hjbjax.problem.pytree import altered, as_partial, is_traced, pytree_datacla
 from hjbjax.problem.types import Array, Control, Disturbance, Number, State
 
 T = TypeVar("T", bound=Callable | None)
-OF_CHANGES = ("mode_rates", "intensities", "landings")  # the functions of sudden changes, of the mode and of the state
+OF_CHANGES = ("mode_rates", "intensities", "landings")  # functions that describe changes of the mode, and jumps
 
 
 @pytree_dataclass(static=("marched", "timed"))
@@ -49,7 +49,7 @@ class ClosedLoop:
     def noise(self, *arguments: Array) -> jax.Array:
         """The noise σ, in the shape in which the problem gives it."""
         t, x, u, d, acts = self._actions(arguments)
-        # without an action switch the noise off as well, otherwise it might carry the state into the target
+        # without an action, switch the noise off as well, otherwise it might carry the state into the target
         sigma = self.problem.noise
         return jnp.where(acts, jnp.asarray(sigma(*self.problem.arguments(x, u, d, t)) if callable(sigma) else sigma), 0)
 

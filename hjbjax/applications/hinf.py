@@ -211,7 +211,7 @@ def _level(trials: list[Trial], cut: Trial | None = None) -> Level:
     """The level from the trials so far; the trial ``cut`` has no verdict."""
     top = min((trial.gamma for trial in trials if trial.feasible), default=math.inf)
     bottom = max((trial.gamma for trial in trials if not trial.feasible and trial is not cut), default=0.0)
-    # a trial that was cut is listed but does not bound the bracket
+    # a trial that was cut short is listed, but does not move an end of the bracket
     status = Status.CONVERGED if cut is None else cut.solution.status
     return Level(top, (bottom, top), tuple(sorted(trials, key=lambda trial: trial.gamma)), status)
 

@@ -74,7 +74,7 @@ class Series:
         lines = [f"{self.name:>9} {'value':>10} {'feedback':>10}  status"]
         rows = zip(self.parameters, self.errors, self.feedback_errors, self.fitted, self.solutions, strict=True)
         for parameter, value, feedback, counts, solution in rows:
-            # the mark concerns the value; the order of the feedback may use fewer entries
+            # for the fit of the value; the fit of the feedback may use fewer entries
             mark = " " if counts else "*"
             lines.append(f"{parameter:>9.4g} {value:>10.3e}{mark}{feedback:>10.3e}  {solution.status.name}")
         lines.append(f"{'order':>9} {self.order:>10.2f} {self.feedback_order:>10.2f}")
@@ -191,8 +191,8 @@ def perturbation_study(
     if clock.interrupted:
         came = f"{len(found)} of {len(noisy) + len(games)} perturbed problems"
         raise SolveError(f"perturbation_study: interrupted after {came}; .solution is the study so far", study)
-    # the worst case is strongest at the lowest level: if it does not reach its bound, no other does; the region need
-    # not be a box, so the disturbance is masked outside it and inner=1
+    # The worst case is strongest at the lowest level: if it does not reach its bound, no other does. The region need
+    # not be a box, so the disturbance is masked outside it, with inner=1.
     watched = dataclasses.replace(found[-1], disturbance=_disturbance_within(found[-1], mask))
     felt = saturation(watched, games[-1], inner=1.0)
     if felt.share > 0:

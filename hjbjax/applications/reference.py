@@ -155,7 +155,7 @@ def strides(fine: Grid, coarse: Grid) -> tuple[slice, ...]:
 
 def at_shared_nodes(value: np.ndarray, fine: Grid, coarse: Grid) -> np.ndarray:
     """The values at the nodes that both grids share."""
-    # without interpolation, whose error would have the order to be measured
+    # no interpolation: its error has the same order as the error to be measured
     return value[strides(fine, coarse)]
 
 

@@ -36,7 +36,7 @@ class Search(NamedTuple):
     share: Any
 
 
-def start(lo: Any, f_lo: Any, hi: Any, f_hi: Any) -> Search:
+def begin_search(lo: Any, f_lo: Any, hi: Any, f_hi: Any) -> Search:
     """The search before its first step."""
     return Search(hi, f_hi, lo, f_lo, lo, f_lo, 0.5 * (hi - lo) / (hi - lo))
 

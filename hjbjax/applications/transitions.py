@@ -10,9 +10,9 @@ with a constant price p_n in each,
 Both steps are implicit and of first order in Δt, as in Achdou et al. (2022). The law stays non-negative with the same
 sum. The excess is evaluated at the end of each step, because a wealth Σ μ a responds to an interest only after a time.
 
-The N equations are solved by Newton steps with the Jacobian J at the new equilibrium, which N linear steps give: in a
-stationary economy the response to a price depends only on the time until it is paid. With 𝒱_k = ∂V_n/∂p_{n+k}, 𝒟_k the
-change of the law in the step n, and ℰ_j the mean excess of a unit mass j steps later,
+The N equations are solved by Newton steps with the Jacobian J at the new equilibrium. N linear steps give all of J,
+because in a stationary economy the response to a price depends only on the time until it is paid. With
+𝒱_k = ∂V_n/∂p_{n+k}, 𝒟_k the change of the law in the step n, and ℰ_j the mean excess of a unit mass j steps later,
 
     J[n, s] = J[n − 1, s − 1] + ℰ_n·𝒟_s,  plus  ∂E/∂p + ∂E/∂V·𝒱_{s−n}  for s ≥ n,
 
@@ -47,13 +47,13 @@ from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.finite_horizon import march
 
 MOST = 60  # Newton steps: a moderate change needs 3 to 8
-SHORTEST = 1 / 64  # of a Newton step
-SHIFT = 1e-3  # of the width of the bracket, for differences: the errors of the steps must not matter
-NEAR = 0.02  # of the change of the law: if more is left at the horizon, the horizon is too short
+SHORTEST = 1 / 64  # the shortest fraction of a Newton step
+SHIFT = 1e-3  # step of finite differences, as a fraction of the bracket; errors of the solves must not matter
+NEAR = 0.02  # if more than this fraction of the change of the law is left at the horizon, it is too short
 # fields of a solution that belong to the stationary problem
 STATIONARY = ("enclosure", "isaacs_gap", "grid_error", "box_error", "monotone_error", "cut", "stopping", "active")
 NODES = ("value", "policy", "disturbance")
-ROUNDING = 1e-6  # of probability, which equilibria with a tolerance may differ by
+ROUNDING = 1e-6  # difference of probabilities that two solves to the same tolerance may have
 MESSAGES = {
     Status.CONVERGED: "The market clears in every time step to the requested tolerance.",
     Status.STALLED: "No part of a Newton step decreases the excess. Begin with guess= from a smaller change, or use "
@@ -137,7 +137,7 @@ def transition(
       throw: raise if the prices are not found; otherwise ``status`` reports it.
 
     Returns:
-      The transition; host level only. A warning says if at the horizon the law is still far from that of ``after``.
+      The transition; host level only. Warns if the law at the horizon is still far from the law of ``after``.
 
     Raises:
       ValueError: an argument is invalid, or ``march`` or ``chain.generator`` refuses the problem.
@@ -334,7 +334,7 @@ def _jacobian(economy: _Economy, count: int, shift: float) -> np.ndarray:
         prices = np.full(count, price)
         prices[-1] += sign * shift
         players, rates = economy.backward(prices)
-        generators.append([laws.generator(_at(rates, n), grid) for n in range(count)])
+        generators.append([laws.sparse_generator(_at(rates, n), grid) for n in range(count)])
         direct.append(economy.excesses(prices, players, np.broadcast_to(law, (count, *law.shape))))
     # entries k = 0, ..., N − 1: the response k steps before the price
     flows = np.stack([(up - down).T @ law.ravel() for up, down in zip(*generators, strict=True)])[::-1] / (2 * shift)

@@ -24,7 +24,7 @@ from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.host_loop import progress_bar
 
-RATE = 0.05  # of the default optimiser, relative to the size of each parameter
+RATE = 0.05  # learning rate of the default optimiser, relative to the size of each parameter
 EARLY = 1e-3  # fraction of the tolerance at which a run ends before its last step
 PATIENCE = 10  # the least number of steps without improvement after which a fit has converged
 DIFFERENCE = 1e-4  # relative step of the finite difference that checks the gradient
@@ -44,8 +44,8 @@ class Fit(files.Saved):
     """The result of ``fit``.
 
     Args:
-      parameters: the best parameters, of the structure of the initial ones, in NumPy. After ``Fit.load`` a dictionary
-        from the place of each array, such as "['mass']", to the array, because a file holds no classes.
+      parameters: the best parameters, of the structure of the initial ones, in NumPy. After ``Fit.load`` they are a
+        dictionary of arrays by name, such as "['mass']", because a file does not store classes.
       loss: the loss at these parameters.
       history: the loss before every step of the best run, shape (k,).
       status: CONVERGED, MAX_STEPS, NONFINITE, INTERRUPTED or TIME_LIMIT.

@@ -55,7 +55,8 @@ def fit_trajectories(
         end before the last observation.
       grid: the grid on which the problem is solved for each trial; it must contain the observed states.
       trajectories: one per path: a Path of ``simulate``, or a tuple (times, states, controls) with shapes (k,), (k, n)
-        and (k, m). All have the same times. Write NaN for what was not observed; every first state is needed.
+        and (k, m). All have the same times. Use NaN for missing observations; the first state of every path is
+        required.
       parameters: the initial parameters, as for ``fit``.
 
     Keyword Args:

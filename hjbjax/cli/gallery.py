@@ -43,7 +43,7 @@ PAGE = "index.html"
 NODES = 20_000  # maximum per problem: tenths of a second once compiled; with 62 x 63 the pendulum is 3 % off
 DPI = 72  # 9.6 inches give 690 pixels, the width of a card
 NEARLY = 0.99  # share of the nodes
-QUALITY = 85  # of WebP: 12 kB per picture; 60 gives 8 kB but frayed edges of shaded fields
+QUALITY = 85  # WebP quality: 12 kB per picture; with 60 it is 8 kB, but edges of shaded fields fray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,17 +84,16 @@ def check_page_folder(out: Path, force: bool = False) -> None:
         raise FileExistsError(f"{out} is not empty: {shown}; give another --out, or --force to add {PAGE} to them")
 
 
-def small_shape(shape: Sequence[int], nodes: int = NODES) -> tuple[int, ...]:
-    """The shape of a grid with about ``nodes`` nodes and the proportions of ``shape``, or ``shape`` if it is smaller.
+def small_shape(shape: Sequence[int]) -> tuple[int, ...]:
+    """The shape of a grid with about ``NODES`` nodes and the proportions of ``shape``, or ``shape`` if it is smaller.
 
     The parity of each count is kept: an odd count has a node at zero, and an even periodic axis has antipodal nodes.
 
     Example:
-      >>> small_shape((200, 201), 4000), small_shape((41, 51, 9), 4000), small_shape((81,), 4000)
-      ((64, 63), (25, 31, 5), (81,))
+      >>> small_shape((200, 201)), small_shape((41, 51, 41)), small_shape((81,))
+      ((142, 141), (25, 31, 25), (81,))
     """
-    # never more nodes than the default, which is fine enough
-    share = min(1.0, (nodes / math.prod(shape)) ** (1 / len(shape)))
+    share = min(1.0, (NODES / math.prod(shape)) ** (1 / len(shape)))
     return tuple(count - 2 * round(count * (1 - share) / 2) for count in shape)
 
 
@@ -167,10 +166,10 @@ def _is_constant(solution: Solution, fixed: dict[int, float]) -> bool:
     return bool(known.size) and float(np.mean(np.isclose(known, np.median(known)))) > NEARLY
 
 
-def webp(figure: Figure, dpi: int = DPI) -> bytes:
+def webp(figure: Figure) -> bytes:
     """A figure as a WebP file."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="webp", dpi=dpi, pil_kwargs={"quality": QUALITY, "method": 6})
+    figure.savefig(stream, format="webp", dpi=DPI, pil_kwargs={"quality": QUALITY, "method": 6})
     return stream.getvalue()
 
 

@@ -128,7 +128,7 @@ def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -
     out.mkdir(parents=True, exist_ok=True)
     check_folder(out, force)  # check again, because the solve may have taken long
     for file in FILES:
-        if file in made:  # of two concurrent commands one fails at the first file
+        if file in made:  # if two commands run at once, one of them fails at the first file
             placement.place(folder / file, out / file, force)
         else:
             (out / file).unlink(missing_ok=True)
@@ -136,7 +136,7 @@ def publish(folder: Path, out: Path, made: Sequence[str], force: bool = False) -
 
 def reason_of(error: OSError, staging: Path, out: Path) -> str:
     """The file and the reason of an error, without the hidden folder, which is gone when the user reads the message."""
-    file = error.filename2 or error.filename  # of a move the destination
+    file = error.filename2 or error.filename  # the destination, if a move failed
     reason = error.strerror or str(error)
     named = f"{file}: {reason}" if file else reason
     return named.replace(f"{staging}{os.sep}", f"{out}{os.sep}")

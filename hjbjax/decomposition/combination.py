@@ -35,7 +35,7 @@ Places = tuple[tuple[int, ...], ...]
 
 @pytree_dataclass(static=("rule", "bound", "states", "controls", "disturbances", "labels"), host=("problem",))
 class BlockSolution(files.Saved):
-    """The value of a problem that falls apart into blocks; made by ``Decomposition.solve`` and ``march``.
+    """The value of a problem that separates into blocks; made by ``Decomposition.solve`` and ``march``.
 
     Args:
       parts: the solutions of the blocks.
@@ -140,7 +140,7 @@ class BlockSolution(files.Saved):
                 return np.full(np.shape(own[-1])[:-1], np.nan)
             marched = part.times is not None
             values = Solution(part.grid, np.asarray(estimate), None, times=part.times)
-            if marched and self.rule == FIRST:  # at an unknown kept time: the largest over time
+            if marched and self.rule == FIRST:  # at an unknown kept time: the largest estimate over time
                 own = (own[-1],)
                 values = Solution(part.grid, np.max(np.asarray(estimate), axis=0), None)
             found.append(values.value_at(*own, clamp=True))

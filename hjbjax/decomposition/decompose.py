@@ -23,7 +23,7 @@ TIMES = 51  # kept times of a march whose blocks must be inside at the same mome
 
 @front_door
 def decompose(problem: Problem, states: int, *, bound: bool = False) -> "Decomposition":
-    """Find blocks of states that do not see each other, from the traces of drift, costs, noise, targets and sets.
+    """Find blocks of states that do not interact, from the traces of drift, costs, noise, targets and sets.
 
     The value of the problem follows from the values of the blocks if costs are sums, if targets and obstacles are
     maxima (intersections) or minima (unions) of signed distances, one for each block.
@@ -40,7 +40,7 @@ def decompose(problem: Problem, states: int, *, bound: bool = False) -> "Decompo
       A Decomposition, whose ``solve`` and ``march`` solve the blocks.
 
     Raises:
-      ValueError: the problem does not fall apart; the message names the coupling.
+      ValueError: the problem does not separate; the message names the coupling.
 
     Example:
       >>> import jax.numpy as jnp
@@ -96,7 +96,7 @@ class Decomposition:
 
     @property
     def problems(self) -> tuple[Problem, ...]:
-        """The problems of the blocks; for the rule "first", of being inside at the end of the horizon."""
+        """The problems of the blocks. For the rule "first" each is to be inside at the end of the horizon."""
         return tuple(block_problem(self.known, self.blocks, i, self.count) for i in range(len(self.blocks.blocks)))
 
     def grids(self, grid: Grid | Sequence[Grid]) -> tuple[Grid, ...]:

@@ -1,4 +1,4 @@
-"""Blocks of states that do not see each other, and the problem of each block.
+"""Blocks of states that do not interact, and the problem of each block.
 
 A function of the problem is split into parts by ``separation``. The states that a part reads, together with all states
 that the drift of these states reads, form a self-contained subsystem; its controls and disturbances are those that its

@@ -91,7 +91,7 @@ def shape(m: np.ndarray, grid: Grid, wanted: np.ndarray) -> tuple[int, ...] | No
     for factor in sorted(np.geomspace(0.5, 2.0, 2001), key=lambda factor: abs(np.log(factor))):
         intervals = np.maximum(np.round(lengths / wanted * factor), 1)
         density = intervals / lengths
-        # 1e-15: where equality is intended, as for two axes of correlation one, products differ in the last digit
+        # 1e-15: two equal numbers, as for axes with correlation one, may differ in the last digit
         if np.all(density * (1 + 1e-15) >= m @ density) and np.all(intervals + ends >= 2):
             return tuple(int(count) for count in intervals + ends)
     return None

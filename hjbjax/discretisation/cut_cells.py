@@ -36,7 +36,7 @@ def level(values: Field, grid: Grid) -> Field:
         up, down = jnp.abs(up), jnp.abs(down)
         end = stencil.on_edge(grid, axis, 1) | stencil.on_edge(grid, axis, -1)  # one slope is missing there
         slope = jnp.where(end, jnp.maximum(up, down), jnp.minimum(up, down))
-        # shifts along all axes at once: in the worst case their effects add up
+        # all coordinates are off at once: in the worst case their effects add up
         slack = slack + ROUNDINGS * eps * farthest * slope
     return jnp.where(jnp.abs(values) <= slack, 0, values)
 
@@ -81,6 +81,6 @@ def _across_seam(coordinate: jax.Array, grid: Grid, axis: int) -> jax.Array:
     if not grid.periodic[axis]:
         return coordinate
     lo, hi = grid.lo[axis], grid.hi[axis]
-    # by comparison and not by %, which would round every coordinate
+    # a comparison instead of %, which would round every coordinate
     inside = jnp.where(coordinate >= hi, coordinate - (hi - lo), coordinate)
     return jnp.where(inside < lo, inside + (hi - lo), inside)

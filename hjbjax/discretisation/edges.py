@@ -142,7 +142,7 @@ def cut(
     """
     counts, totals = np.zeros((2, grid.ndim, 2), int)
     acting, earning = np.broadcast_to(acting, grid.shape), _actions_cost(problem, grid.ndim, value.dtype)
-    # by flat indices in C order, since a table of all indices would take as much memory as the values
+    # flat indices in C order, because a table of all indices would take as much memory as the values
     strides = [math.prod(grid.shape[axis + 1 :]) for axis in range(grid.ndim)]
     sides, sample = grid.sides("projected"), [np.linspace(0, n - 1, min(n, PLANES)).astype(int) for n in grid.shape]
 

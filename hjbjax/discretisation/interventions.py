@@ -105,7 +105,7 @@ class Interventions:
         """V*, and exact equality with the value after an intervention where V is closer to it than rounding."""
         eps, near = jnp.finfo(value.dtype).eps, jnp.zeros_like(value, bool)
         for offset, after in zip(self.offsets, self.after(value), strict=True):
-            # V may be near zero where neither V after the intervention nor the cost, their difference, is
+            # the sizes of both terms, because their sum may be near zero
             size = jnp.abs(after) + jnp.abs(rolled(value, offset))
             near |= jnp.isfinite(size) & (after - value <= ROUNDING * eps * size)
         exact = self.cheapest(jnp.where(near, jnp.inf, value))  # along whole paths, each node from the next one
@@ -115,8 +115,8 @@ class Interventions:
         """The nodes of every intervention, if V is ``value`` and not intervening is ``worth``; bool (*grid) each.
 
         Following the interventions of a node leads to a node without any, since no round trip is free. A push is
-        compared with V at the next node, if this is higher than its worth: if all nodes of a push region improve
-        without the push, each less than the next one, then all of them leave the region, not only the last one.
+        compared with V at the next node, or with the worth of that node if it is lower. Otherwise, if all nodes of a
+        push region would gain by not pushing, each less than the next one, only the last one would leave the region.
         """
         bounds = self.after(self.cheapest(jnp.maximum(worth, value) if self.pushes else worth))
         left = functools.reduce(jnp.minimum, bounds, worth) < worth
@@ -140,7 +140,7 @@ class Interventions:
 
         if self.pushes:
             return self._settled(value, change, push)
-        for _ in self.offsets:  # a row may lead to a row of another change
+        for _ in self.offsets:  # the node that one intervention leads to may make another intervention
             for offset in self.offsets:
                 value = change(value, offset)
         return value
@@ -157,7 +157,7 @@ class Interventions:
 
         if self.once:
             return again(value)
-        most = sum(value.shape)  # ends the loop under a round trip that earns, which is refused only if it is known
+        most = sum(value.shape)  # ends the loop even if a round trip earns
 
         def step(carry: tuple[Field, Any, Any]) -> tuple[Field, Any, Any]:
             old, _, count = carry

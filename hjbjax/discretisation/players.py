@@ -37,7 +37,7 @@ SHORT = 200  # largest number of operations on components for which evaluations 
 # row. At 300 operations a search in a loop compiles in half the time (6 s instead of 12.9 s), and similarly for two
 # layers of 32; both run as fast as written out.
 ALONE = 80
-CELLS = {1: 64, 2: 16}  # by the inputs of a group: the largest number of combinations of pieces to try
+CELLS = {1: 64, 2: 16}  # inputs of a group: the largest number of combinations of pieces to try
 QUADRATICS = 50  # in a ball: three inputs make 27 without noise, two make 49 with noise; beyond, programs are faster
 PROGRAMS = 256  # choices of concave kinks, each a convex program: eight components without noise, four with noise
 
@@ -52,7 +52,7 @@ class Player:
       exact: True if the optimum is found exactly rather than by samples.
       driven: for every input the drift components that it drives.
       groups: the inputs, grouped by shared drift components and by products in the cost; H is a sum over the groups.
-        All inputs of a ball are one group if they are a program, and all inputs of a simplex always.
+        All inputs of a simplex are one group, and all inputs of a ball if their optimum needs quadratic programs.
       cells: for every group the number of pieces that the Hamiltonian may have.
       programs: for every group, True if its optimum is found by quadratic programs.
       curved: for every input, True if the cost may contain its square.
@@ -170,7 +170,7 @@ def _player(admissible: AdmissibleSet | None, sign: int, found: dependence.Influ
     inputs = found.control if sign > 0 else found.disturbance
     driven = tuple(drift.driven_by([j]) for j in inputs)
     curved = tuple(cost.has_square([j]) for j in inputs)
-    # then the rate of leaving a node is convex
+    # an affine drift makes the rate of leaving a node convex
     affine = drift.affine_in(inputs) and found.switching.affine_in(inputs) and noise.free_of(inputs)
     # without bounds there are no ends, and the fastest action is known only once it has been chosen
     at_ends = (affine and not is_unbounded(admissible)) or isinstance(admissible, (Finite, type(None)))

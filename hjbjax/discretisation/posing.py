@@ -294,7 +294,7 @@ def _check_rate(problem: Problem, grid: Grid, name: str) -> Any:
 def _least(on: Discretisation) -> tuple[Scalar, Scalar, Scalar]:
     """β − g at the first node where it is not positive and finite, its flat index, and the number of these nodes.
 
-    Without one, the first number is the least β − g.
+    If there is no such node, the first number is the least β − g.
     """
     problem = on.problem
     if problem.growth is None:

@@ -85,7 +85,8 @@ def broken_stencils(link: Links, grid: Grid, axis: int, lost: Mask | None = None
     found = None if lost is None else _spread(jnp.asarray(lost), grid, axis, 3)
     if link.meets_up is None or link.meets_down is None:
         return found
-    near = _spread(link.meets_up[0] | link.meets_down[0], grid, axis, 2)  # of the last free node before a target
+    # the second difference at the last free node before a target
+    near = _spread(link.meets_up[0] | link.meets_down[0], grid, axis, 2)
     return near if found is None else found | near
 
 

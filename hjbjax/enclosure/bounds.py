@@ -1,7 +1,7 @@
 """The bounds as functions, and ``Enclosure``, the result of ``enclose``, with its files."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -25,7 +25,8 @@ class Bound:
       coefficients: of every spline, each (*grid).
       levels: the function of every spline that is a bound.
       sign: 1 for a lower and −1 for an upper bound, before a change of sign.
-      caps: numbers per cell to which the bound is raised, and then lowered, (2, *cells); ``None`` without a target.
+      caps: the least and the largest bound in every cell, (2, *cells); a bound is first raised to the least one, and
+        then lowered to the largest one. ``None`` without a target.
       negated: True if minus this is the bound, for rewards.
     """
 
@@ -56,6 +57,32 @@ class Bound:
         return dataclasses.replace(self, negated=not self.negated)
 
 
+def evaluate_in_box(
+    function: Callable[[np.ndarray], np.ndarray], grid: Grid, x: Numbers | Sequence, outside: float | bool, caller: str
+) -> np.ndarray:
+    """A function at states in the box of a grid, shape (...).
+
+    Args:
+      function: takes states (count, n) in the box and returns (count,).
+      grid: the grid. Along a periodic axis all states are in the box.
+      x: the states, shape (n,) or (..., n).
+      outside: the result at states outside the box.
+      caller: the beginning of a message.
+    """
+    states, n = np.asarray(x, float), grid.ndim
+    if states.ndim == 0 or states.shape[-1] != n:
+        raise ValueError(f"{caller}: got states of shape {states.shape}, wanted (..., {n})")
+    flat = states.reshape(-1, n)
+    lo, hi = np.asarray(grid.lo, float), np.asarray(grid.hi, float)
+    cyclic = np.array(grid.periodic)
+    flat = np.where(cyclic & ((flat < lo) | (flat > hi)), lo + np.mod(flat - lo, hi - lo), flat)
+    inside = np.all((flat >= lo) & (flat <= hi), axis=-1)
+    found = np.full(len(flat), outside)
+    if np.any(inside):
+        found[inside] = function(flat[inside])
+    return found.reshape(states.shape[:-1])
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Enclosure(files.Saved):
     """Two functions between which the value of the continuous problem lies; made by ``enclose``.
@@ -66,7 +93,7 @@ class Enclosure(files.Saved):
       upper: the upper bound at the nodes. Without a discount it may be infinite, and for rewards the lower one.
       status: CONVERGED if the mean width is at most ``tol`` times the range of V, otherwise MAX_STEPS. The bounds hold
         in both cases.
-      message: the problem that the bounds refer to, and their mean width.
+      message: the problem whose value is bounded, and the mean width of the bounds.
       stats: "seconds", "bytes" (the estimated memory) and "corrections".
       remaining: e^{−βT} at the nodes, shape (*grid), where T is a lower bound of the time until a path can meet a
         projected end. If the problem continues beyond the box, its value differs from the value between walls by at
@@ -105,25 +132,11 @@ class Enclosure(files.Saved):
         Returns:
           Shape (...), in cost units; NaN outside the box.
         """
-        return self._at("lower_at", 0, x)
+        return evaluate_in_box(self.bounds[0].at, self.grid, x, np.nan, "Enclosure.lower_at")
 
     def upper_at(self, x: Numbers | Sequence) -> Any:
         """The upper bound between the nodes; see ``lower_at``."""
-        return self._at("upper_at", 1, x)
-
-    def _at(self, name: str, side: int, x: Numbers | Sequence) -> Any:
-        states, n = np.asarray(x, float), self.grid.ndim
-        if states.ndim == 0 or states.shape[-1] != n:
-            raise ValueError(f"Enclosure.{name}: got states of shape {states.shape}, wanted (..., {n})")
-        flat = states.reshape(-1, n)
-        lo, hi = np.asarray(self.grid.lo, float), np.asarray(self.grid.hi, float)
-        cyclic = np.array(self.grid.periodic)
-        flat = np.where(cyclic & ((flat < lo) | (flat > hi)), lo + np.mod(flat - lo, hi - lo), flat)
-        inside = np.all((flat >= lo) & (flat <= hi), axis=-1)
-        found = np.full(len(flat), np.nan)
-        if np.any(inside):
-            found[inside] = self.bounds[side].at(flat[inside])
-        return found.reshape(states.shape[:-1])
+        return evaluate_in_box(self.bounds[1].at, self.grid, x, np.nan, "Enclosure.upper_at")
 
     def __repr__(self) -> str:
         return f"Enclosure({self.status}, largest width {np.max(self.width):.3g} on {self.grid.size} nodes)"

@@ -1,10 +1,10 @@
 """Bounds at kinks: the best of several candidates, each of which continues V across kinks from one side.
 
-Where two ways of acting are equally good V has a concave kink, and a differentiable upper bound cannot touch it. But
-there V is the least of differentiable functions, one for each way of acting. On the other side of the kink such a
+Where two ways of acting are equally good, V has a concave kink, which a differentiable upper bound cannot touch. But V
+is the least of two differentiable functions there, one for each way of acting. On the other side of the kink such a
 function is about the extrapolation 2 V(x − s) − V(x − 2s), if s is longer than the distance over which a spline rounds
-the kink off. The extrapolations along both directions of every axis are candidates. In a cell only those have to be
-bounds that are the best somewhere in it.
+the kink off. The extrapolations along both directions of every axis are candidates. A candidate has to be a bound only
+in cells where it is the best one somewhere.
 
 Each candidate is corrected along the paths of its control, since they leave the kink to one side.
 """
@@ -20,15 +20,15 @@ from hjbjax.enclosure.discounted import DiscountTask, Kept, Move, sizes_of
 from hjbjax.enclosure.levels import Levels
 from hjbjax.problem.grid import Grid
 
-FAR = 0.1  # fraction of the range of V: a bound that is further away somewhere is compared with other candidates ...
-MORE = 3  # ... which take this many times the corrections
-STEP = 8  # cells: the mean and the spline round a kink over about seven
-RISE = 0.5  # fraction of the range of V by which a candidate is worse where it reads beyond an end
+FAR = 0.1  # more candidates are tried if a bound is off by this fraction of the range of V somewhere ...
+MORE = 3  # ... with this many times as many corrections
+STEP = 8  # cells; the mean and the spline smooth a kink over about seven
+RISE = 0.5  # a candidate loses this fraction of the range of V where it reads beyond an end
 LEVEL = 3.0  # the level of a correction is the shift divided by this number
-STAGNANT = 5  # corrections without progress after which no more are made ...
-FALLS = 0.9  # ... where a smaller largest defect, by this factor, is progress too
-PROGRESS = 0.1  # fraction of the wanted width, or of the shift over ten, by which a correction must narrow the bound
-REFRESHED = 4  # corrections with the same factors of their equations
+STAGNANT = 5  # stop after this number of corrections without progress ...
+FALLS = 0.9  # ... unless the largest defect fell by this factor
+PROGRESS = 0.1  # least gain of a correction, relative to the wanted width or to a tenth of the shift
+REFRESHED = 4  # corrections that share one factorisation
 
 
 def bound(
@@ -55,21 +55,22 @@ def bound(
 
 
 def _best(kept: Kept, sign: int) -> np.ndarray:
-    """The bound at the nodes, shape (*grid); of an upper bound the negative."""
+    """The bound at the nodes, shape (*grid), with its sign changed for an upper bound."""
     return np.max([sign * each - shift for each, shift in kept], axis=0)
 
 
 def extrapolations(values: np.ndarray, grid: Grid, sign: int) -> list[np.ndarray]:
     """The extrapolations of smooth values along both directions of every axis, shape (*grid) each.
 
-    Where one reads beyond an end of the box it is lowered (``sign`` 1, for lower bounds) or raised (−1).
+    Next to an end of the box, where an extrapolation would need V beyond the end, it is lowered (``sign`` 1, for lower
+    bounds) or raised (−1).
     """
     found = []
     for axis, cyclic in enumerate(grid.periodic):
         count = grid.shape[axis]
         if count < 4 * STEP:
             continue
-        wide = correction.continued(values, axis, 2 * STEP, cyclic=cyclic)
+        wide = correction.pad(values, axis, 2 * STEP, cyclic=cyclic)
         ramp = np.maximum(0, 1 - np.arange(count) / (2 * STEP)) ** 2 * (RISE * np.ptp(values) * (not cyclic))
         for direction in (1, -1):
             near, far = (np.take(wide, np.arange(count) + 2 * STEP - k * direction * STEP, axis=axis) for k in (1, 2))

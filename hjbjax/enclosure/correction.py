@@ -1,4 +1,4 @@
-"""Corrections of a candidate W by the defects that paths meet on their way.
+"""Corrections of a candidate W by the defects along the paths.
 
 Let E solve (β − L^π) E = β s, where L^π is the generator of the Markov chain under a policy π: the discounted mean of s
 along the path from each node. Subtracting E from W lowers the defect β W − H by about β s. Without a discount the right
@@ -22,8 +22,8 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered
 
-REACH = 2  # cells by which a source is widened, and then smoothed, so that its E is smooth on the grid
-SHARE = 40  # the cells of an axis over its reach on fine grids: otherwise E falls too steeply across the paths
+REACH = 2  # a source is widened and then smoothed over this number of cells, so that E is smooth on the grid
+SHARE = 40  # on fine grids the reach is this part of an axis, otherwise E falls too steeply across the paths
 MARGIN = 1.3  # a source is larger than the defect, because the chain spreads it
 MEAN = np.array([1, 3, 6, 7, 6, 3, 1]) / 27  # three means of three neighbours
 DIRECT = 2  # states up to which the linear equations are factored
@@ -39,14 +39,6 @@ def on_nodes(cells: np.ndarray, grid: Grid, join: Callable[..., Any] = np.mean) 
     return cells
 
 
-def generator(problem: Problem, grid: Grid, policy: np.ndarray, t: float = 0.0) -> Any:
-    """The generator of the Markov chain under the controls of both players, a sparse matrix."""
-    count = 0 if problem.controls is None else problem.controls.dim
-    own, other = policy[..., :count], policy[..., count:]
-    disturbance = other if problem.is_game else None
-    return chain.generator(problem, grid, own if count else None, disturbance=disturbance, t=t)
-
-
 def solver(problem: Problem, grid: Grid, policy: np.ndarray, rate: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """The solution E of (β − L^π) E = s as a function of s.
 
@@ -60,7 +52,9 @@ def solver(problem: Problem, grid: Grid, policy: np.ndarray, rate: np.ndarray) -
     from scipy.sparse.linalg import bicgstab, splu
 
     without = altered(problem, discount=1.0) if callable(problem.discount) else problem
-    matrix = (diags_array(rate.ravel()) - generator(without, grid, policy)).tocsc()
+    count = 0 if problem.controls is None else problem.controls.dim
+    own, other = policy[..., :count] if count else None, policy[..., count:] if problem.is_game else None
+    matrix = (diags_array(rate.ravel()) - chain.generator(without, grid, own, disturbance=other)).tocsc()
     if grid.ndim <= DIRECT:
         factors = splu(matrix)
         return lambda source: factors.solve(source.ravel()).reshape(grid.shape)
@@ -83,11 +77,11 @@ def smooth_cover(excess: np.ndarray, grid: Grid) -> np.ndarray:
     return MARGIN * excess
 
 
-def continued(values: np.ndarray, axis: int, count: int, *, cyclic: bool) -> np.ndarray:
-    """Values with this number of nodes more beyond both ends of an axis, continued linearly unless it is periodic."""
-    pad = [(count * (other == axis),) * 2 for other in range(values.ndim)]
+def pad(values: np.ndarray, axis: int, count: int, *, cyclic: bool) -> np.ndarray:
+    """Values with ``count`` more nodes beyond both ends of an axis: linear extrapolations, or periodic."""
+    widths = [(count * (other == axis),) * 2 for other in range(values.ndim)]
     mode: dict[str, Any] = {"mode": "wrap"} if cyclic else {"mode": "reflect", "reflect_type": "odd"}
-    return np.pad(values, pad, **mode)
+    return np.pad(values, widths, **mode)
 
 
 def mollified(values: np.ndarray, grid: Grid) -> np.ndarray:
@@ -95,7 +89,7 @@ def mollified(values: np.ndarray, grid: Grid) -> np.ndarray:
     from scipy.ndimage import correlate1d
 
     for axis, cyclic in enumerate(grid.periodic):
-        wide = correlate1d(continued(values, axis, 3, cyclic=cyclic), MEAN, axis)
+        wide = correlate1d(pad(values, axis, 3, cyclic=cyclic), MEAN, axis)
         values = np.take(wide, range(3, wide.shape[axis] - 3), axis=axis)
     return values
 

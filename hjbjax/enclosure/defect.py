@@ -18,8 +18,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from hjbjax.enclosure import games
+from hjbjax.enclosure.cell_functions import Cell, Functions, admissible_sets, functions_over
 from hjbjax.enclosure.interpolant import SEAM, Cells, Spline
-from hjbjax.enclosure.minimum import Cell, Functions, cell_defect, functions
+from hjbjax.enclosure.minimum import control_defect
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing import intervals as iv
@@ -102,7 +103,7 @@ def blocks(problem: Problem, grid: Grid, spline: Spline, index: Index, depth: in
             if problem.target is not None:
                 (level,) = tf.taylor_forms(problem.target, x).reshape(-1)
                 ended = np.broadcast_to(level.bounds(cells.radii).hi <= 0, cells.ranges[0].lo.shape)
-            known = (games.functions if problem.is_game else functions)(problem, x, cells.radii)
+            known = functions_over(problem, x, cells.radii)
             found.append(CellBlock(block, number, cells, known, signs, ended))
     return found
 
@@ -121,7 +122,7 @@ def parts_of(grid: Grid, spline: Spline, index: Index, depth: int, stopped: Sequ
       spline: its cells.
       index: the number of each cell along every axis.
       depth: the number of bisections along every axis.
-      stopped: axes along which only the middle of a cell counts, which is a node.
+      stopped: axes along which a part is only the middle of its cell, which is a node.
     """
     ends = _parts(grid, _sides(index, spline), [depth] * grid.ndim, stopped)
     return spline.cells([np.repeat(i, 2 ** (depth * grid.ndim)) for i in index], ends)
@@ -143,14 +144,14 @@ def defects(spline: Spline, known: Sequence[CellBlock], values: np.ndarray, befo
       before: the defects so far, if the blocks do not contain all cells.
     """
     if before is None:
-        sets = [known[0].known.problem.controls, known[0].known.problem.disturbances]
-        policy = np.zeros((*spline.shape, sum(each.dim for each in sets if each is not None)))
+        inputs = sum(each.dim for each in admissible_sets(known[0].known.problem) if each is not None)
+        policy = np.zeros((*spline.shape, inputs))
         before = Defects(np.full(spline.shape, -np.inf), np.full(spline.shape, np.inf), policy)
     total = Defects(before.low.copy(), before.high.copy(), before.policy)
     for block in known:
         total.low[block.index], total.high[block.index] = np.inf, -np.inf
     for block in known:
-        found, policy = over_block(block, values)
+        found, policy = over_block(block, *block.cells.scalars(values))
         low, high = found.ends
         if block.ended is not None:
             low, high = np.where(block.ended, np.inf, low), np.where(block.ended, -np.inf, high)
@@ -185,22 +186,18 @@ def _parts(
     return found
 
 
-def over_block(block: CellBlock, values: np.ndarray) -> tuple[Interval, np.ndarray]:
+def over_block(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:
     """Bounds of (β W − H)/β over parts of some cells, and a control; without a discount −H over the least cost.
 
     Args:
       block: the parts.
-      values: the coefficients of W.
+      w: W over these parts.
+      p: its gradient.
     """
-    return over_forms(block, *block.cells.scalars(values))
-
-
-def over_forms(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:
-    """The same for W and its gradient over these parts."""
     if block.known.problem.is_game:
         return _over_block_of_game(block, w, p)
     every = frozenset(block.walls)
-    found = cell_defect(Cell(block.known, w, p), [every] if every else [])
+    found = control_defect(Cell(block.known, w, p), [every] if every else [])
     low, high = found.defect.ends
     rises = np.ones(np.shape(low), bool)
     for axis, side in block.walls.items():
@@ -211,7 +208,7 @@ def over_forms(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.n
         low = (point(low) - loss).lo
     if every:
         high = np.where(rises, np.maximum(high, found.least[every]), high)
-    return _per_unit(low, high, found.unit), found.policy
+    return _per_unit(low, high, block.known.unit), found.policy
 
 
 def _over_block_of_game(block: CellBlock, w: Form, p: list[Form]) -> tuple[Interval, np.ndarray]:
@@ -222,7 +219,7 @@ def _over_block_of_game(block: CellBlock, w: Form, p: list[Form]) -> tuple[Inter
         outward = iv.where(side > 0, slope, -slope)
         rises[axis], falls[axis] = outward.hi > 0, outward.lo < 0
     stopped = games.subsets(rises), games.subsets(falls)
-    found, policy = games.cell_defect(Cell(block.known, w, p), *stopped)
+    found, policy = games.game_defect(Cell(block.known, w, p), *stopped)
     return _per_unit(*found.ends, block.known.unit), policy
 
 

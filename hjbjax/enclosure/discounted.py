@@ -21,17 +21,17 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing.intervals import point
 
-SMOOTHING = 3  # defect corrections before the bounds part
+SMOOTHING = 3  # largest number of defect corrections of V, which both bounds start from
 WIDENED = 5.0  # the level of a correction is the largest defect divided by this number
-FALLS = 0.7  # a correction of the defect must reduce its mean, and a smoother candidate the shift, to this fraction
-HELPS = 0.6  # a correction along the paths that leaves more than this fraction of the shift is compared with another
+FALLS = 0.7  # a defect correction must reduce the mean defect to this fraction, a smoother candidate the shift
+HELPS = 0.6  # other candidates are tried if a correction leaves more than this fraction of the shift
 SMOOTHER = 3  # the largest number of times that a candidate is smoothed
-STAGNANT = 2  # corrections without progress after which a bound is given up
-BISECTIONS = 2  # of the cells with the largest defects
-LARGEST = 0.5  # fraction of the largest defect from which on a cell is bisected
+STAGNANT = 2  # stop after this number of corrections without progress
+BISECTIONS = 2  # bisections of the cells with the largest defects
+LARGEST = 0.5  # cells with at least this fraction of the largest defect are bisected
 SHARE = 0.03  # largest fraction of the cells that are bisected: their parts take as long as half of all cells
-WORTH = 0.97  # no cell is bisected if those below leave more than this fraction of the shift
-GAIN = 0.97  # a correction that leaves more than this fraction of the width is no progress
+WORTH = 0.97  # bisect only if the other cells require less than this fraction of the shift
+GAIN = 0.97  # progress means that less than this fraction of the width is left
 Kept: TypeAlias = list[tuple[np.ndarray, float]]  # the candidates of a bound, and their shifts
 Move = Callable[[np.ndarray], np.ndarray]
 
@@ -155,8 +155,8 @@ class DiscountTask:
     def start(self, values: np.ndarray, found: Defects, sign: int) -> tuple[np.ndarray, Defects]:
         """The candidate, or a smoother one that requires a far smaller shift, and its defects.
 
-        H is concave in the slope, so a mean of W over nearby states is as good a lower bound as W, apart from the
-        variation of the problem over this distance. It rounds kinks off, around which the spline of V oscillates.
+        H is concave in the slope, so a mean of W over nearby states is about as good a lower bound as W. It smooths the
+        kinks, around which the spline of V oscillates.
         """
         for _ in range(SMOOTHER):
             smoother = self.continued(correction.mollified(values, self.grid))
@@ -169,7 +169,9 @@ class DiscountTask:
         return values, found
 
     def lead(self, values: np.ndarray, kept: Kept, sign: int) -> np.ndarray:
-        """The shift from which on a candidate is nowhere in a cell better than the bounds so far, shape (*cells)."""
+        """The least shift with which a candidate is not better than the bounds so far anywhere in a cell, shape
+        (*cells).
+        """
         found = np.full(self.spline.shape, np.inf)
         for other, shift in kept:
             found = np.minimum(found, (point(self.spline.largest(sign * (values - other))) + point(shift)).hi)
@@ -197,7 +199,7 @@ class DiscountTask:
         return max(options, key=lambda each: each[0])[1:]
 
     def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
-        """The defects with the cells that determine the shift cut into parts, at most a fraction of ``SHARE``."""
+        """The defects after the cells that determine the shift, at most a fraction ``SHARE``, are cut into parts."""
         for depth in range(1, BISECTIONS + 1):
             sizes = sizes_of(found, lead, sign)
             if not np.all(np.isfinite(sizes)):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.enclosure import branches, correction, defect, exits
+from hjbjax.enclosure import branches, checks, correction, defect, exits
 from hjbjax.enclosure.bounds import Enclosure
 from hjbjax.enclosure.discounted import DiscountTask
 from hjbjax.enclosure.interpolant import LARGEST, Spline
@@ -15,8 +15,8 @@ from hjbjax.enclosure.undiscounted import exit_task
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import REWARD
-from hjbjax.problem.problem import Problem, is_constrained, is_discounted, is_random
-from hjbjax.problem.pytree import front_door, is_traced
+from hjbjax.problem.problem import Problem, is_constrained, is_discounted
+from hjbjax.problem.pytree import front_door
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.settings import own_settings
@@ -122,34 +122,25 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
     Raises:
       ValueError: there is no proof for the problem, its grid or its solution.
     """
-    for given, kind in ((problem, Problem), (solution, Solution)):
-        if not isinstance(given, kind):
-            raise TypeError(f"enclose: got {type(given).__name__}, wanted a {kind.__name__}")
-    if is_traced(problem, solution.value):
-        raise ValueError("enclose: got traced numbers; call it outside of jit, vmap and grad")
+    checks.check_types("enclose", problem, solution)
     grid, costs = solution.grid, in_costs(solution)
-    lacking = {
-        "random paths (noise, jumps or modes)": is_random(problem),
-        "modes": problem.modes is not None, "pushes": bool(problem.pushes), "growth": problem.growth is not None,
+    others = {
         "a target with a discount": problem.target is not None and bool(is_discounted(problem)),
         "time_dependent=True": problem.time_dependent,
         "a stopping_cost, a stopping_reward or a running_max": is_constrained(problem)
         or problem.stopping_reward is not None,
         "no discount and no target": problem.target is None and not is_discounted(problem),
         "a marched solution": solution.times is not None,
-    }  # fmt: skip
-    if found := [name for name, there in lacking.items() if there]:
-        raise ValueError(
-            f"enclose: got {' and '.join(found)}; wanted a stationary problem whose paths are not random,\n"
-            "with a discount or with a target. Bounds on the true value are proved only for these problems;\n"
-            "Solution.grid_error and box_error are estimates for the others"
-        )
-    kinds = sorted({kind for pair in grid.edges if pair for kind in pair if kind != "projected"})
-    if kinds:
-        raise ValueError(
-            f"enclose: got {' and '.join(kinds)} ends; wanted projected ends or periodic axes. Solve on a larger box\n"
-            "with edges='projected': the bounds are those of the problem with walls at its ends"
-        )
+    }
+    wanted = (
+        "a stationary problem whose paths are not random,\n"
+        "with a discount or with a target. Bounds on the true value are proved only for these problems;\n"
+        "Solution.grid_error and box_error are estimates for the others"
+    )
+    advice = (
+        ". Solve on a larger box\nwith edges='projected': the bounds are those of the problem with walls at its ends"
+    )
+    checks.check_ingredients("enclose", problem, grid, others, wanted, advice)
     value = np.asarray(costs.value, float)
     if problem.target is not None and value.shape == grid.shape and np.any(np.isfinite(value)):
         value = correction.nearest_known(value, np.isfinite(value), grid)  # infinite where no path meets the target

@@ -4,8 +4,8 @@ Paths end where g ≤ 0 and pay ψ. A candidate W must be compared with ψ where
 
     W − ψ = W − ψ − μ g   where g = 0,     W − ψ ≤ W − ψ − μ g   where g ≤ 0 and μ ≥ 0.
 
-With μ = (DW − Dψ)·Dg/|Dg|² the right side hardly varies in a cell, so its range there is narrow: its width falls with
-the square of the width of the cell, although W − ψ itself varies over the cell by as much as V.
+W − ψ varies over a cell by as much as V does. With μ = (DW − Dψ)·Dg/|Dg|² the right side hardly varies, so its range is
+narrow: the width of the range falls with the square of the width of the cell.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ class Exit:
 
     @quietly
     def shift(self, values: np.ndarray, sign: int) -> tuple[float, np.ndarray]:
-        """The number by which W exceeds ψ at most where g = 0, or ψ exceeds W if ``sign`` is −1.
+        """An upper bound of W − ψ where g = 0, or of ψ − W if ``sign`` is −1.
 
         Args:
           values: the coefficients of W.

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.enclosure.minimum import Cell, Functions, least_over, rate_and_unit
+from hjbjax.enclosure.cell_functions import NOT_QUADRATIC, Cell, gain
+from hjbjax.enclosure.minimum import least_over
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Box, Finite
 from hjbjax.tracing import quadratics as qu
@@ -23,15 +24,15 @@ from hjbjax.tracing import taylor_forms as tf
 from hjbjax.tracing.intervals import Interval
 from hjbjax.tracing.taylor_forms import Form
 
-RESPONSES = 3  # alternating best responses that find û and d̂ if G is not separable
+RESPONSES = 3  # rounds of best responses that find û and d̂ if G is not separable
 INSIDE = 1 - 1e-12  # a committed control is multiplied by this, so that rounding does not take it out of its ball
-Stopped = dict[frozenset[int], np.ndarray]  # sets of coordinates whose motion walls may stop, True where this matters
+Stopped = dict[frozenset[int], np.ndarray]  # coordinates whose motion walls may stop, with True where this matters
 Table = list[list[qu.Polynomial]]  # G for every listed control of one player, and every one of the other
 
 
 @dataclasses.dataclass(frozen=True)
-class Player:
-    """One player: its listed controls, or its set and the numbers of its inputs in polynomials.
+class Inputs:
+    """The inputs of one player: its listed controls, or its set and the numbers of its inputs in polynomials.
 
     Attributes:
       points: the controls of a finite set; ``None`` for another set.
@@ -48,9 +49,10 @@ class Player:
         """The numbers of the inputs."""
         return range(self.first, self.first + (0 if self.admissible is None else self.admissible.dim))
 
-    def arguments(self) -> list[Any]:
-        """Every listed control, or the number of inputs."""
-        return [len(self.numbers)] if self.points is None else list(self.points)
+    @property
+    def count(self) -> int:
+        """The number of listed controls; one for another set."""
+        return 1 if self.points is None else len(self.points)
 
     def least(self, terms: qu.Polynomial) -> tuple[Form, list[np.ndarray]]:
         """The minimum of a polynomial over the set, and a minimiser at the centre.
@@ -76,46 +78,19 @@ class Player:
         return total
 
 
-def players(problem: Problem) -> tuple[Player, Player]:
+def inputs_of(problem: Problem) -> tuple[Inputs, Inputs]:
     """The control and the disturbance."""
     found, first = [], 0
     for admissible in (problem.controls, problem.disturbances):
         if isinstance(admissible, Finite):
-            found.append(Player(np.asarray(admissible.points, float), None, first))
+            found.append(Inputs(np.asarray(admissible.points, float), None, first))
         else:
-            found.append(Player(None, admissible, first))
+            found.append(Inputs(None, admissible, first))
         first += len(found[-1].numbers)
     return found[0], found[1]
 
 
-def functions(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> Functions:
-    """The functions of a game over parts of cells, for every pair of listed controls.
-
-    Raises:
-      ValueError: they are not quadratic polynomials of the inputs.
-    """
-    rate, unit = rate_and_unit(problem, x, radii)
-    control, disturbance = players(problem)
-    options = []
-    try:
-        for u in control.arguments():
-            for d in disturbance.arguments():
-                cost = qu.Polynomial({(): tf.constant(0.0)})
-                if problem.cost is not None:
-                    cost = qu.quadratics(problem.cost, x, u, d)[0]
-                options.append((cost, qu.quadratics(problem.drift, x, u, d)))
-    except qu.NotQuadraticError:
-        raise ValueError(_NOT_QUADRATIC) from None
-    return Functions(problem, x, radii, rate, unit, options)
-
-
-_NOT_QUADRATIC = (
-    "enclose: got a game whose drift or cost is not a quadratic polynomial of the inputs, or has products of inputs\n"
-    "of one player; wanted such a polynomial, or a Finite set for the player that it depends on otherwise"
-)
-
-
-def cell_defect(cell: Cell, rising: Stopped, falling: Stopped) -> tuple[Interval, np.ndarray]:
+def game_defect(cell: Cell, rising: Stopped, falling: Stopped) -> tuple[Interval, np.ndarray]:
     """The range of β W − H, and the controls of both players near the saddle at the centre, (count, m + l).
 
     Args:
@@ -124,18 +99,18 @@ def cell_defect(cell: Cell, rising: Stopped, falling: Stopped) -> tuple[Interval
       falling: the same where W may decrease outward.
     """
     try:
-        return _cell_defect(cell, rising, falling)
+        return _game_defect(cell, rising, falling)
     except qu.NotQuadraticError:
-        raise ValueError(_NOT_QUADRATIC) from None
+        raise ValueError(NOT_QUADRATIC) from None
 
 
-def _cell_defect(cell: Cell, rising: Stopped, falling: Stopped) -> tuple[Interval, np.ndarray]:
+def _game_defect(cell: Cell, rising: Stopped, falling: Stopped) -> tuple[Interval, np.ndarray]:
     known = cell.functions
-    control, disturbance = players(known.problem)
-    whole, count = known.rate * cell.w, len(disturbance.arguments())
+    control, disturbance = inputs_of(known.problem)
+    whole, count = known.rate * cell.w, disturbance.count
 
     def table(without: frozenset[int]) -> Table:
-        found = [_gain(cost, drift, cell.p, without) for cost, drift in known.options]
+        found = [gain(cost, drift, cell.p, without) for cost, drift in known.options]
         return [found[k : k + count] for k in range(0, len(found), count)]
 
     gains = table(frozenset())
@@ -150,7 +125,7 @@ def _cell_defect(cell: Cell, rising: Stopped, falling: Stopped) -> tuple[Interva
         best: Any = np.inf
         sides = (control, disturbance) if sign > 0 else (disturbance, control)
         tables = {each: table(each) if sign > 0 else _negated(table(each)) for each in (frozenset[int](), *stopped)}
-        for j in range(len(sides[1].arguments())):
+        for j in range(sides[1].count):
             worst: Any = -np.inf
             for without, rows in tables.items():
                 least = tf.minimum(*(sides[0].least(sides[1].committed(row[j], actions[sign]))[0] for row in rows))
@@ -162,20 +137,12 @@ def _cell_defect(cell: Cell, rising: Stopped, falling: Stopped) -> tuple[Interva
     return Interval(-committed(falling, -1), committed(rising, 1)), policy
 
 
-def _gain(cost: qu.Polynomial, drift: list[qu.Polynomial], p: Sequence[Form], without: frozenset[int]) -> qu.Polynomial:
-    """L + f·p, without some components of the drift."""
-    for i, (component, slope) in enumerate(zip(drift, p, strict=True)):
-        if i not in without:
-            cost = cost + component * qu.Polynomial({(): slope})
-    return cost
-
-
 def _negated(rows: Table) -> Table:
     """Minus G, with the players exchanged."""
     return [[-each for each in column] for column in zip(*rows, strict=True)]
 
 
-def _exact(rows: Table, control: Player, disturbance: Player, order: str) -> Form | None:
+def _exact(rows: Table, control: Inputs, disturbance: Inputs, order: str) -> Form | None:
     """H, or ``None`` if there is no formula."""
     if not len(control.numbers) and not len(disturbance.numbers):
         if order == "upper":
@@ -193,7 +160,7 @@ def _exact(rows: Table, control: Player, disturbance: Player, order: str) -> For
     return rows[0][0].get((), tf.constant(0.0)) + least - most
 
 
-def _near_saddle(rows: Table, control: Player, disturbance: Player) -> dict[int, list[np.ndarray]]:
+def _near_saddle(rows: Table, control: Inputs, disturbance: Inputs) -> dict[int, list[np.ndarray]]:
     """Numbers for the inputs of the disturbance (key 1) and of the control (key −1), by best responses."""
     found = {1: [np.zeros(()) for _ in disturbance.numbers], -1: [np.zeros(()) for _ in control.numbers]}
     terms = rows[0][0]
@@ -206,7 +173,7 @@ def _near_saddle(rows: Table, control: Player, disturbance: Player) -> dict[int,
 
 
 def _policy(
-    rows: Table, control: Player, disturbance: Player, actions: dict[int, list[np.ndarray]], cell: Cell
+    rows: Table, control: Inputs, disturbance: Inputs, actions: dict[int, list[np.ndarray]], cell: Cell
 ) -> np.ndarray:
     """Both controls at the centre, (count, m + l)."""
     shape, order = np.shape(cell.w.range.lo), cell.functions.problem.isaacs
@@ -240,18 +207,18 @@ def by_vertices(cell: Cell) -> Interval | None:
         min_d max_u sup(−G) ≥ −H ≥ max_u min_d inf(−G).
     """
     known = cell.functions
-    rows = [_gain(cost, drift, cell.p, frozenset()) for cost, drift in known.options]
-    control, disturbance = players(known.problem)
+    rows = [gain(cost, drift, cell.p) for cost, drift in known.options]
+    control, disturbance = inputs_of(known.problem)
     corners = [_corners(player) for player in (control, disturbance)]
     if not rows or any(len(term) > 1 for terms in rows for term in terms) or None in corners:
         return None
     lo: Any = []
     hi: Any = []
-    for k in range(0, len(rows), len(disturbance.arguments())):
+    for k in range(0, len(rows), disturbance.count):
         for u in corners[0] or []:
             own = [
                 disturbance.committed(control.committed(terms, u), d)
-                for terms in rows[k : k + len(disturbance.arguments())] for d in corners[1] or []
+                for terms in rows[k : k + disturbance.count] for d in corners[1] or []
             ]  # fmt: skip
             found = [each.get((), tf.constant(0.0)).bounds(known.radii) for each in own]
             lo.append([-each.hi for each in found])
@@ -261,7 +228,7 @@ def by_vertices(cell: Cell) -> Interval | None:
     return Interval(least, np.min(np.stack(columns), axis=0))
 
 
-def _corners(player: Player) -> list[list[np.ndarray]] | None:
+def _corners(player: Inputs) -> list[list[np.ndarray]] | None:
     """The vertices of a box, one empty list if there are no inputs, or ``None`` for another set."""
     if player.admissible is None:
         return [[]]

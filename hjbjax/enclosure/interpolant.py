@@ -25,9 +25,9 @@ from hjbjax.tracing.taylor_forms import Form
 Ends = Sequence[tuple[np.ndarray, np.ndarray]]
 DEGREE = 2
 POINTS = DEGREE + 1
-SEAM = 2.0**-30  # by which half cells at the ends of a periodic axis overlap: more than their rounding
-LARGEST = 1e150  # of the coefficients: nothing is known about a spline with larger ones, whose sums may overflow
-ROUNDING = 64 * EPS  # relative, of a weight on a part of a cell, and of the sum over the nodes along one axis
+SEAM = 2.0**-30  # overlap of the half cells at the ends of a periodic axis: more than their rounding
+LARGEST = 1e150  # coefficients may be this large; sums of larger ones may overflow, so they give no bounds
+ROUNDING = 64 * EPS  # relative error of a weight on a part of a cell, and of a sum along one axis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -343,7 +343,7 @@ class Spline:
             middle, row = (place.lo + place.hi) / 2, weights.rows[..., i]
             while len(row) > 1:
                 row = _mixed(row, middle)
-            # outside [0, 1] by rounding, where the weights are hardly larger
+            # rounding may put a place outside [0, 1], where the weights are hardly larger
             moved = slope.size[i] * table.lengths.hi[i] * (place.hi - place.lo)
             rows.append(row)
             error = error + (weights.error[i] + 2 * moved) / weights.size[i]

@@ -52,8 +52,7 @@ def levels_of(least: np.ndarray, largest: np.ndarray, relative: np.ndarray, star
       least: a lower bound of W in every cell, (count,).
       largest: an upper bound of W in every cell, (count,).
       relative: the relative defect of every cell, (count,); a negative one counts as zero.
-      start: a number that the function at the lowest level exceeds this level by: for a lower bound an upper bound of
-        the permitted number, for an upper bound a lower one.
+      start: the value of the function at the lowest level, minus this level.
       sign: 1 for a lower and −1 for an upper bound.
     """
     low, high = float(np.min(least)), float(np.max(largest))
@@ -78,7 +77,7 @@ def levels_of(least: np.ndarray, largest: np.ndarray, relative: np.ndarray, star
 
 
 def _largest_over(first: np.ndarray, last: np.ndarray, numbers: np.ndarray, count: int) -> np.ndarray:
-    """The largest number of all intervals first ≤ k ≤ last that contain k, for every k; −∞ if there is none.
+    """For every k, the largest of the numbers of all intervals first ≤ k ≤ last that contain k; −∞ if there is none.
 
     An interval is covered by two of its size rounded down to a power of two.
     """

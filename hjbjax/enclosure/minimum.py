@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.enclosure.cell_functions import Cell, cost_form, gain
 from hjbjax.problem.sets import Ball, Box, Finite, Simplex, is_unbounded, ranges
 from hjbjax.tracing import intervals as iv
 from hjbjax.tracing import quadratics as qu
@@ -29,100 +29,23 @@ Actions = list[Interval]  # the range of every input
 
 
 @dataclasses.dataclass(frozen=True)
-class Functions:
-    """The functions of a problem over parts of cells.
-
-    Attributes:
-      problem: a problem of one player with costs.
-      x: the state.
-      radii: the largest distance from the centre along every axis.
-      rate: the discount.
-      unit: the positive number by which a defect is divided: the discount, or without one a lower bound of the cost,
-        or one in a tube.
-      options: cost and drift as polynomials of the control, or for every action of a finite set; empty if they are not
-        quadratic polynomials.
-    """
-
-    problem: Problem
-    x: list[Form]
-    radii: list[np.ndarray]
-    rate: Form
-    unit: Interval
-    options: list[tuple[qu.Polynomial, list[qu.Polynomial]]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-    """A candidate W over parts of cells.
-
-    Attributes:
-      functions: the functions of the problem.
-      w: the candidate.
-      p: its gradient.
-    """
-
-    functions: Functions
-    w: Form
-    p: list[Form]
-
-
-@dataclasses.dataclass(frozen=True)
 class CellDefect:
     """The defect over parts of cells.
 
     Attributes:
       defect: the range of β W − H.
-      unit: the positive number by which the defect is divided.
       least: for each set of coordinates that a wall stops, an upper bound of β W − H without their motion.
       drift: the range of every component of the drift under the minimisers.
       policy: a control near the minimiser at the centre, shape (count, m); proves nothing.
     """
 
     defect: Interval
-    unit: Interval
     least: dict[frozenset[int], np.ndarray]
     drift: list[Interval]
     policy: np.ndarray
 
 
-def functions(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> Functions:
-    """The functions of a problem over parts of cells.
-
-    Args:
-      problem: a problem of one player with costs.
-      x: the state.
-      radii: the largest distance from the centre along every axis.
-    """
-    rate, unit = rate_and_unit(problem, x, radii)
-    options: list[tuple[qu.Polynomial, list[qu.Polynomial]]] = []
-    if isinstance(problem.controls, Finite):
-        for u in np.asarray(problem.controls.points, float):
-            action = [tf.constant(each) for each in u]
-            drift = tf.taylor_forms(problem.drift, x, action)
-            paid = qu.Polynomial({(): _running_cost(problem, x, action)})
-            options.append((paid, [qu.Polynomial({(): each}) for each in drift]))
-        return Functions(problem, x, radii, rate, unit, options)
-    count = 0 if problem.controls is None else problem.controls.dim
-    with contextlib.suppress(qu.NotQuadraticError):
-        cost = qu.Polynomial({(): tf.constant(0.0)})
-        if problem.cost is not None:
-            cost = qu.quadratics(problem.cost, x, count)[0]
-        options.append((cost, qu.quadratics(problem.drift, x, count)))
-    return Functions(problem, x, radii, rate, unit, options)
-
-
-def rate_and_unit(problem: Problem, x: list[Form], radii: list[np.ndarray]) -> tuple[Form, Interval]:
-    """The discount, and the number by which a defect is divided, see ``Functions``."""
-    (rate,) = tf.taylor_forms(problem.discount, *([x] * callable(problem.discount))).reshape(-1)
-    if is_discounted(problem):  # an interval that contains zero makes the defect infinite
-        return rate, rate.range
-    if problem.target is None:  # a tube, where only the sign of the defect counts
-        return rate, point(1.0)
-    least = _running_cost(problem, x, *any_actions(problem)).bounds(radii).lo
-    return rate, point(np.maximum(least, 0.0))
-
-
-def cell_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
+def control_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefect:
     """The defect of a candidate.
 
     Args:
@@ -140,20 +63,16 @@ def cell_defect(cell: Cell, stopped: Sequence[frozenset[int]] = ()) -> CellDefec
 def _by_formula(
     cell: Cell, stopped: Sequence[frozenset[int]], cost: qu.Polynomial, drift: list[qu.Polynomial]
 ) -> CellDefect:
-    """By the minimum of a quadratic polynomial of the control."""
+    """The defect from the formula for the minimum of a quadratic polynomial of the control."""
     known = cell.functions
 
     def defect(without: frozenset[int]) -> tuple[Interval, Actions, list[np.ndarray]]:
-        total = cost
-        for i, (component, slope) in enumerate(zip(drift, cell.p, strict=True)):
-            if i not in without:
-                total = total + component * qu.Polynomial({(): slope})
-        least, actions, near = least_over(known.problem.controls, total)
+        least, actions, near = least_over(known.problem.controls, gain(cost, drift, cell.p, without))
         return (known.rate * cell.w - least).bounds(known.radii), actions, near
 
     found, actions, near = defect(frozenset())
     speeds = [range_over(component, actions) for component in drift] if stopped else []
-    return CellDefect(found, known.unit, {each: defect(each)[0].hi for each in stopped}, speeds, _stacked(near, cell))
+    return CellDefect(found, {each: defect(each)[0].hi for each in stopped}, speeds, _stacked(near, cell))
 
 
 def _stacked(inputs: Sequence[np.ndarray], cell: Cell) -> np.ndarray:
@@ -229,7 +148,7 @@ def _common(squares: Sequence[Form | None]) -> Form:
 
 
 def norm(b: Sequence[Form]) -> Form:
-    """The Euclidean norm; the derivative where it may be zero is that of all directions."""
+    """The Euclidean norm. Where it may be zero, its derivative is the range over all directions."""
 
     def function(*ranges: Interval) -> Interval:
         total = iv.squared(ranges[0])
@@ -275,7 +194,7 @@ def least_quadratic(b: Form, c: Form, lo: float, hi: float) -> tuple[Form, Inter
 
     def seconds(slope: Interval, curvature: Interval) -> tf.Curvature:
         inside, outside = (whole.lo > lo) & (whole.hi < hi), (whole.lo == whole.hi)
-        response = -(point(0.5) / curvature)  # of the minimiser to the slope, where it is inside
+        response = -(point(0.5) / curvature)  # the derivative of an inner minimiser with respect to the slope
         response = iv.where(inside, response, iv.union(response, zero))
         # without curvature the minimiser jumps from one end to the other
         response = iv.where(curvature.lo > 0, response, iv.entire(response))
@@ -290,7 +209,7 @@ def least_quadratic(b: Form, c: Form, lo: float, hi: float) -> tuple[Form, Inter
 
 
 def _middle(u: Interval, lo: float, hi: float) -> np.ndarray:
-    """A number between the ends of an interval and between two numbers."""
+    """The middle of an interval, moved into [lo, hi]."""
     return np.clip(np.nan_to_num((u.lo + u.hi) / 2), lo, hi)
 
 
@@ -333,49 +252,22 @@ def minimisers(slope: Interval, curvature: Interval, lo: float, hi: float) -> In
 
 
 def _enumerated(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
-    """By enumeration of a finite set."""
+    """The defect from an enumeration of a finite set."""
     known = cell.functions
     costs: dict[frozenset[int], list[Form]] = {each: [] for each in (frozenset[int](), *stopped)}
     for paid, drift in known.options:
         for without, found in costs.items():
-            found.append(_hamiltonian(paid[()], [each[()] for each in drift], cell.p, without))
+            found.append(gain(paid[()], [each[()] for each in drift], cell.p, without))
     whole = known.rate * cell.w
     points, gains = np.asarray(known.problem.controls.points, float), [each.centre.lo for each in costs[frozenset()]]
     best = np.argmin(np.stack(np.broadcast_arrays(*gains)), axis=0)
     bounds = {without: (whole - tf.minimum(*found)).bounds(known.radii) for without, found in costs.items()}
     speeds = [iv.union(*(drift[k][()].range for _, drift in known.options)) for k in range(len(cell.p))]
-    return CellDefect(
-        bounds[frozenset()], known.unit, {each: bounds[each].hi for each in stopped}, speeds, points[best]
-    )
-
-
-def any_actions(problem: Problem) -> list[list[Form]]:
-    """Every input of each player as one interval."""
-    return [any_action(each) for each in (problem.controls, problem.disturbances)[: 1 + problem.is_game]]
-
-
-def any_action(admissible: Any) -> list[Form]:
-    """Every input of the control as one interval."""
-    if admissible is None:
-        return []
-    inputs = [Interval(np.asarray(lo), np.asarray(hi)) for lo, hi in zip(*ranges(admissible), strict=True)]
-    return [Form(each, each) for each in inputs]
-
-
-def _running_cost(problem: Problem, x: list[Form], *inputs: list[Form]) -> Form:
-    return tf.constant(0.0) if problem.cost is None else tf.taylor_forms(problem.cost, x, *inputs).item()
-
-
-def _hamiltonian(paid: Form, drift: Sequence[Form], p: Sequence[Form], without: frozenset[int]) -> Form:
-    """L + f·p, without some components of the drift."""
-    for i, (component, slope) in enumerate(zip(drift, p, strict=True)):
-        if i not in without:
-            paid = paid + component * slope
-    return paid
+    return CellDefect(bounds[frozenset()], {each: bounds[each].hi for each in stopped}, speeds, points[best])
 
 
 def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
-    """By cutting the set into pieces: the control is one more coordinate of each box."""
+    """The defect from pieces of the set of controls: the control is one more coordinate of each box."""
     known = cell.functions
     problem, n, whole = known.problem, len(known.x), known.rate * cell.w
     high = {each: np.asarray(-np.inf) for each in (frozenset[int](), *stopped)}
@@ -389,19 +281,19 @@ def _by_pieces(cell: Cell, stopped: Sequence[frozenset[int]]) -> CellDefect:
         ]
         action = tf.coordinates(box, [point(c) for c in centre], n + len(box), n)
         drift = list(tf.taylor_forms(problem.drift, known.x, action))
-        paid = _running_cost(problem, known.x, action)
+        paid = cost_form(problem, known.x, action)
         for without in high:
-            gain = whole - _hamiltonian(paid, drift, cell.p, without)
-            high[without] = np.maximum(high[without], gain.bounds(radii).hi)
+            own = whole - gain(paid, drift, cell.p, without)
+            high[without] = np.maximum(high[without], own.bounds(radii).hi)
             if not without and inside:  # the derivatives over the piece contain those at its centre
-                at_centre = dataclasses.replace(gain, range=iv.entire(gain.range))
+                at_centre = dataclasses.replace(own, range=iv.entire(own.range))
                 still = [*known.radii, *(np.zeros(()) for _ in box)]
                 found = at_centre.bounds(still).lo
                 policy = np.where((found > low)[..., None], centre, policy)
                 low = np.maximum(low, found)
         speeds.append([each.range for each in drift])
     return CellDefect(
-        Interval(low, high[frozenset()]), known.unit, {each: high[each] for each in stopped},
+        Interval(low, high[frozenset()]), {each: high[each] for each in stopped},
         [iv.union(*each) for each in zip(*speeds, strict=True)], policy,
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The conditions of the cells of time and space on the levels that bound a marched tube.
+"""Conditions on the levels that bound a marched tube, for every cell of time and space.
 
 Let W(t, x) be a spline in time and space near the value of
 
@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.enclosure import defect, games
+from hjbjax.enclosure.cell_functions import Cell
 from hjbjax.enclosure.interpolant import Spline, with_largest
-from hjbjax.enclosure.minimum import Cell
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.types import Array
@@ -34,8 +34,8 @@ from hjbjax.tracing.intervals import EPS, quietly
 from hjbjax.tracing.taylor_forms import Form
 
 UP = 1 + 1e-12  # more than the rounding of a few products and sums
-TRIALS = 100  # of the rise of the level in one time slab
-MORE = 1.01  # factor by which a trial exceeds the rise that the cells so far require
+TRIALS = 100  # guesses of the rise of the level in one time slab
+MORE = 1.01  # a guess exceeds the rise that the last one required by this factor
 
 
 def steady_drift(drift: Callable, z: Array, *inputs: Array) -> Array:
@@ -255,7 +255,7 @@ def _either(join: Callable[[Form, Form], Form], left: Form | None, right: Form |
 
 
 def _parts(index: Sequence[np.ndarray], bisections: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
-    """The numbers of some cells in parts of one block each, if every cell is bisected this number of times."""
+    """The numbers of some cells, in blocks that are small enough if every cell is bisected this number of times."""
     step = max(1, defect.BLOCK >> bisections)
     for first in range(0, len(index[0]), step):
         yield tuple(each[first : first + step] for each in index)
@@ -263,7 +263,7 @@ def _parts(index: Sequence[np.ndarray], bisections: int = 0) -> Iterator[tuple[n
 
 def _rates(block: defect.CellBlock, w: Form, p: list[Form]) -> tuple[np.ndarray, np.ndarray]:
     """Upper bounds of −W_t − H and of W_t + H over parts of some cells."""
-    rate, _ = defect.over_forms(block, w, p)
+    rate, _ = defect.over_block(block, w, p)
     narrow = None if block.walls else games.by_vertices(Cell(block.known, w, p))
     if narrow is not None:
         rate = iv.meet(rate, narrow)
@@ -291,7 +291,7 @@ def spline_coefficients(values: np.ndarray, mesh: Grid) -> np.ndarray:
 
 
 def _extended(rows: np.ndarray, cyclic: bool) -> np.ndarray:
-    """The coefficients along the first axis with their continuation: periodic by two more, or by a parabola."""
+    """The coefficients along the first axis and beyond its ends: periodic, or along a parabola."""
     if cyclic:
         return np.concatenate([rows[-1:], rows, rows[:2]])
     ghosts = [3 * (rows[a] - rows[b]) + rows[c] for a, b, c in ((0, 1, 2), (-1, -2, -3))]

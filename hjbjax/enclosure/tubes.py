@@ -6,12 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hjbjax.enclosure import checks
+from hjbjax.enclosure.bounds import evaluate_in_box
 from hjbjax.enclosure.interpolant import LARGEST, Spline
 from hjbjax.enclosure.tube_levels import Sides, TubeTask
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem, is_discounted, is_random
-from hjbjax.problem.pytree import front_door, is_traced
+from hjbjax.problem.problem import Problem, is_discounted
+from hjbjax.problem.pytree import front_door
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import in_unit_box
 from hjbjax.problem.types import Numbers
@@ -21,8 +23,8 @@ from hjbjax.tracing import closures
 from hjbjax.tracing.operations import operations
 from hjbjax.tracing.taylor_forms import traced
 
-FEWEST = 3  # times, for a parabola
-WIDER = 4  # times that the band of evaluated cells is doubled before a side is given up
+FEWEST = 3  # kept times, because coefficients beyond an end need three
+WIDER = 4  # largest number of times that the band of evaluated cells is doubled
 WORTH = 0.3  # a cell is bisected if its rate exceeds this fraction of the mean rate of the level
 
 
@@ -41,7 +43,7 @@ class TubeEnclosure:
       stats: "seconds", "bytes" (the estimated memory), "cells" and "bisected", the numbers of evaluated and of bisected
         cells.
       spline: the cells of W in (t, x).
-      coefficients: of W at the first times, which determine W at t = 0.
+      coefficients: the coefficients of W at the first times, which determine W at t = 0.
       thresholds: W ≥ the first one proves V > v, or V ≥ v for ``avoid``, and −W ≥ the second one V ≤ v, or V < v.
       above: True for ``avoid``.
     """
@@ -68,28 +70,20 @@ class TubeEnclosure:
         Returns:
           Booleans, shape (...). False outside the box.
         """
-        return self._beyond(x, 0 if self.above else 1, False)
+        return self._is_beyond(x, 0 if self.above else 1)
 
     def outer_at(self, x: Numbers | Sequence) -> np.ndarray:
         """False at states that are proved not to be in the tube; True outside the box."""
-        return ~self._beyond(x, 1 if self.above else 0, False)
+        return ~self._is_beyond(x, 1 if self.above else 0)
 
-    def _beyond(self, x: Numbers | Sequence, side: int, otherwise: bool) -> np.ndarray:
-        """True where W is beyond the threshold of a side."""
-        states, n = np.asarray(x, float), self.grid.ndim
-        if states.ndim == 0 or states.shape[-1] != n:
-            raise ValueError(f"TubeEnclosure: got states of shape {states.shape}, wanted (..., {n})")
-        flat = states.reshape(-1, n)
-        lo, hi = np.asarray(self.grid.lo, float), np.asarray(self.grid.hi, float)
-        cyclic = np.array(self.grid.periodic)
-        flat = np.where(cyclic & ((flat < lo) | (flat > hi)), lo + np.mod(flat - lo, hi - lo), flat)
-        inside = np.all((flat >= lo) & (flat <= hi), axis=-1)
-        found = np.full(len(flat), otherwise)
-        if np.any(inside):
-            own = flat[inside]
-            w = self.spline.at(np.column_stack([np.zeros(len(own)), own])).values(self.coefficients)
-            found[inside] = (w.lo if side == 0 else -w.hi) >= self.thresholds[side]
-        return found.reshape(states.shape[:-1])
+    def _is_beyond(self, x: Numbers | Sequence, side: int) -> np.ndarray:
+        """True where W is beyond the threshold of a side; False outside the box."""
+
+        def is_beyond(states: np.ndarray) -> np.ndarray:
+            w = self.spline.at(np.column_stack([np.zeros(len(states)), states])).values(self.coefficients)
+            return (w.lo if side == 0 else -w.hi) >= self.thresholds[side]
+
+        return evaluate_in_box(is_beyond, self.grid, x, False, "TubeEnclosure")
 
     def __repr__(self) -> str:
         return f"TubeEnclosure(level {self.level:g}, shifts {self.shifts[0]:.3g} and {self.shifts[1]:.3g})"
@@ -102,11 +96,11 @@ def enclose_tube(
     """An inner and an outer set of a tube, with proof: neither the grid nor rounding is neglected.
 
     A spline W in time and space has the defect −W_t − H(x, DW). Let σ(t) be a level of W that changes at the rate of
-    the largest defect of the cells that it meets. Then {W(0) ≥ σ(0)} belongs to {V ≥ v}, where v is σ at the horizon up
-    to the errors of W there and at the obstacles. The same holds from the other side.
+    the largest defect of the cells that it meets. Then {W(0) ≥ σ(0)} is inside {V ≥ v}, where v is the level σ at the
+    horizon, apart from the errors of W there and at the obstacles. The same holds from the other side.
 
     Args:
-      problem: a problem of ``reach``, ``avoid`` or ``reach_avoid``, or another one without running cost, discount,
+      problem: a problem of ``reach``, ``avoid`` or ``reach_avoid``, or another problem without running cost, discount,
         noise, jumps and modes. Drift and distances must be Lipschitz functions that are defined on the whole box. In a
         game the drift must be a quadratic polynomial of the inputs, or the sets finite.
       solution: a solution of this problem by ``march`` with equally spaced ``times`` from zero to the horizon. The sets
@@ -229,28 +223,16 @@ def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray,
     Raises:
       ValueError: there is no proof for the problem, its grid or its solution.
     """
-    for given, kind in ((problem, Problem), (solution, Solution)):
-        if not isinstance(given, kind):
-            raise TypeError(f"enclose_tube: got {type(given).__name__}, wanted a {kind.__name__}")
-    if is_traced(problem, solution.value):
-        raise ValueError("enclose_tube: got traced numbers; call it outside of jit, vmap and grad")
+    checks.check_types("enclose_tube", problem, solution)
     grid = solution.grid
-    lacking = {
+    others = {
         "a running cost": problem.cost is not None or problem.reward is not None,
-        "a discount": bool(is_discounted(problem)), "random paths (noise, jumps or modes)": is_random(problem),
-        "modes": problem.modes is not None, "pushes": bool(problem.pushes), "growth": problem.growth is not None,
-        "a target": problem.target is not None,
+        "a discount": bool(is_discounted(problem)), "a target": problem.target is not None,
         "rewards": problem.stopping_reward is not None or problem.terminal_reward is not None,
         "a march from other values than the terminal cost": bool(solution.stats.get("start")),
     }  # fmt: skip
-    if found := [name for name, there in lacking.items() if there]:
-        raise ValueError(
-            f"enclose_tube: got {' and '.join(found)}; wanted a problem of reach, avoid or reach_avoid.\n"
-            "Sets are proved only for these problems"
-        )
-    kinds = sorted({kind for pair in grid.edges if pair for kind in pair if kind != "projected"})
-    if kinds:
-        raise ValueError(f"enclose_tube: got {' and '.join(kinds)} ends; wanted projected ends or periodic axes")
+    wanted = "a problem of reach, avoid or reach_avoid.\nSets are proved only for these problems"
+    checks.check_ingredients("enclose_tube", problem, grid, others, wanted)
     horizon = float(solution.stats.get("horizon", np.nan)) if solution.times is not None else np.nan
     times = np.asarray([] if solution.times is None else solution.times, float)
     even = len(times) >= FEWEST and np.allclose(

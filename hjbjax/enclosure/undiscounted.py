@@ -5,9 +5,9 @@ Let L ≥ ℓ > 0 outside the target. With κ as in ``levels``,
 - if L + f·DW ≥ −κ L for all controls and W ≤ ψ + c where paths end, V ≥ Φ(W) with Φ' = 1/(1 + κ);
 - if L + f·DW ≤ κ L for the minimiser and W ≥ ψ − c where paths end, V ≤ Φ(W) with Φ' = 1/(1 − κ).
 
-W falls along the paths of the second kind. So a cell matters only at levels above its own, and a cell without a bound,
-such as one at a concave kink, makes the upper bound infinite only at levels above it. Such cells are lifted above all
-others by the correction along the paths, which changes nothing at states whose paths do not meet them.
+W falls along the paths of the second kind. So a cell matters only at levels above its own. A cell without a bound, such
+as a cell at a concave kink, makes the upper bound infinite only above its level. A correction lifts these cells above
+all others. It changes nothing at states whose paths do not meet them.
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing.intervals import Interval, point
 
-BAD = 0.5  # relative defect from which on a cell is lifted out of the way of the others
+BAD = 0.5  # cells with at least this relative defect are lifted above the others
 LEAK = 0.01  # discount of the corrections, times the range of V over the least cost: keeps their equations regular
-LIMIT = 0.5  # larger relative defects count as this in a defect correction
-BLANK = 1e-5  # difference of a value from the exit cost that counts as none, relative to the range of V
+LIMIT = 0.5  # a defect correction clips relative defects to this
+BLANK = 1e-5  # values this close to the exit cost, relative to the range of V, are equal to it
 LIFT = 1.5  # height of a lifted cell, relative to the range of W
 HELD = 1e12  # rate of the nodes whose correction is prescribed, relative to the leak
 
@@ -113,7 +113,7 @@ class ExitTask(DiscountTask):
             if not kept:
                 required = correction.on_nodes(np.maximum(sizes, 0.0), self.grid, np.max)
             kept.append((values, levels))
-            # the coefficients instead of the spline, because this only judges the progress
+            # coefficients instead of values of the spline: this only measures the progress
             gap = np.minimum(sign * (base - levels.at(point(values))), best)
             stagnant = 0 if self.gains(gap, best) else stagnant + 1
             best = gap
@@ -152,10 +152,10 @@ class ExitTask(DiscountTask):
         return levels_of(ranges.lo[there], ranges.hi[there], sizes[there], -sign * start, sign)
 
     def caps(self, beyond: np.ndarray, sign: int) -> np.ndarray:
-        """Numbers per cell to which the bound is raised, and then lowered.
+        """The least and the largest bound in every cell, see ``Bound``.
 
         Inside the target they are the bounds of ψ. In a cell that the boundary may cut the upper bound is at least ψ.
-        The lower bound is there less than ψ without a cap, except in a few cells.
+        The lower bound is below ψ there without a cap, except in a few cells.
 
         Args:
           beyond: True for these cells, (*cells).
@@ -171,7 +171,7 @@ class ExitTask(DiscountTask):
         return np.stack([least, np.where(inside, self.exit.largest, largest)])
 
     def refined(self, values: np.ndarray, found: Defects, sign: int) -> Defects:
-        """The defects with the cells with the largest finite ones cut into parts, at most one in ten."""
+        """The defects after the cells with the largest finite ones, at most one in ten, are cut into parts."""
         for depth in range(1, BISECTIONS + 1):
             sizes = np.where(self.exit.inside, -np.inf, found.high if sign > 0 else -found.low)
             chosen = sizes >= max(float(np.quantile(sizes, 0.9)), 1e-6)

@@ -8,9 +8,9 @@ layer of cells.
 
 import numpy as np
 
+from hjbjax.enclosure.cell_functions import any_actions
 from hjbjax.enclosure.defect import all_cells
 from hjbjax.enclosure.interpolant import Spline
-from hjbjax.enclosure.minimum import any_actions
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing import taylor_forms as tf

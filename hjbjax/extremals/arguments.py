@@ -10,7 +10,7 @@ from hjbjax.extremals.boundary_value import BoundaryValueProblem
 from hjbjax.extremals.necessary_conditions import Extremal
 from hjbjax.problem.arguments import positive
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, check_constant_discount
 from hjbjax.problem.pytree import as_partial
 from hjbjax.problem.sets import Simplex, refuse_unbounded
 from hjbjax.problem.types import Array, Number
@@ -30,16 +30,7 @@ def check_problem(problem: object, tol: float, max_nodes: int, time_limit: float
     ):
         if getattr(problem, name) is not None:
             raise ValueError(f"pontryagin: got a problem with {name}, wanted one without: {why}")
-    if callable(problem.discount):
-        raise ValueError(
-            "pontryagin: got a discount that is a function of the state, wanted a number; make ∫ discount dt a state z "
-            "with z(0) = 0, and multiply the costs by exp(−z)"
-        )
-    if problem.growth is not None:
-        raise ValueError(
-            "pontryagin: got a problem with growth, wanted one without; make ∫ (discount - growth) dt a state z with "
-            "z(0) = 0, and multiply the costs by exp(−z)"
-        )
+    check_constant_discount(problem, "pontryagin")
     if callable(problem.controls):
         raise ValueError(
             "pontryagin: got bounds of the controls that depend on the state, wanted a fixed set; solve it on a grid"

@@ -27,7 +27,7 @@ from hjbjax.solution.clock import Clock, Stopped
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
-COLUMNS = 101  # of a guess; the solver adds nodes where necessary
+COLUMNS = 101  # mesh nodes of a guess; the solver adds nodes where necessary
 SAMPLES = 400  # number of intervals in which a simulated guess keeps its control constant, because a feedback may jump
 FAR = 1e3  # times 1 + |x₀|: a simulation that gets there has diverged
 NEWTON = 50  # steps to the boundary of a target; a distance takes one, a squared distance about ten

@@ -146,7 +146,7 @@ def _with_an_empty_arc(
 
 def _merge_equal_neighbours(order: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge neighbouring arcs of the same value."""
-    # inputs that do not jump are NaN, which counts as equal here
+    # inputs that do not jump are NaN here, and NaN equals NaN
     new = [True] + [not np.array_equal(a, b, equal_nan=True) for a, b in itertools.pairwise(order)]
     return order[new], np.append(0.0, starts[new][1:])
 

@@ -210,7 +210,7 @@ def _sample(admissible: Box | Ball | Simplex, key: Key, shape: tuple[int, ...]) 
 
 def _disturbance(look: Callable, weight: Number, points: Array, duration: Number, t: Number, x: State) -> Array:
     """The worst case times ``weight``, plus a signal that is linear between its points."""
-    # by index and share, since the points are equally spaced; the last cell extends past the end of the path
+    # interpolate by index, because the points are equally spaced; the last cell extends past the end of the path
     place = jnp.clip(t / duration, 0, 1) * (POINTS - 1)
     cell = jnp.clip(jnp.floor(place).astype(int), 0, POINTS - 2)
     signal = points[cell] + (place - cell) * (points[cell + 1] - points[cell])

@@ -34,12 +34,12 @@ from hjbjax.tracing.closures import settled
 from hjbjax.tracing.components import of_state
 
 MANY = 10  # a path whose cost misses V by more than this number of estimated errors breaks the promise
-LEAST = 0.02  # of the range of V: the extra cost allowed for interpolating a feedback between the nodes
-UNKNOWN = 0.02  # of the range of V: the assumed error of a value without an estimate
-STILL = 1e-6  # of the box: the motion, in its second half, of a path that is at rest
+LEAST = 0.02  # fraction of the range of V: allowed extra cost of a feedback interpolated between the nodes
+UNKNOWN = 0.02  # fraction of the range of V: the assumed error of a value without an estimate
+STILL = 1e-6  # fraction of the box: a path that moves less in its second half is at rest
 # a path comes to rest if its second half moves less than these shares of the box and of the motion in the first half
 RESTS, SLOWS = 1e-3, 1e-2
-AWAY, BACK = 0.5, 0.1  # of the extent of its second half, for a path that circles inside a cell
+AWAY, BACK = 0.5, 0.1  # the same for a path that circles inside a cell, as fractions of its extent
 SAME = 1e-5  # two problems count as the same if their numbers at a state differ by no more than this
 FAR = 1.5  # cells: a circling path moves away from a state by more than this, and returns within one
 

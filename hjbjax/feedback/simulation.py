@@ -41,7 +41,7 @@ from hjbjax.tracing.closures import OF_ACTION, OF_STATE, RATES, holds_tracers, o
 
 Feedback: TypeAlias = GridFeedback | Callable | None  # None where there is no control
 
-INTERVALS = 200  # of the output, by default
+INTERVALS = 200  # output intervals, by default
 MOST_INTERVALS = 10**7  # 80 MB per state
 
 _jit_part = jax.jit(integrate_part, donate_argnames="so_far")  # overwrites the rows of all intervals in place
@@ -76,16 +76,16 @@ def simulate(
     Args:
       problem: the system and its costs or rewards.
       feedback: a Solution, a ``greedy_feedback``, a solution without a grid, as of ``hopf`` and ``neural``, or a
-        function that returns the control, shape (m,). ``None`` if there is no control.
-        With a Solution of a problem with a stopping cost, the path ends and pays ψ where stopping is optimal, that is
-        where V = ψ at all surrounding nodes. Without a running cost, pushes, changes of the mode by choice, and noise
-        it continues, and its cost is the cost of the best moment to stop.
-        A marched Solution must be stored at enough times: at least ten over the duration. A path as long as the horizon
-        pays at its end what ``march`` assumed there: ``start``, the terminal cost, else ψ, else g.
-        If the feedback is a function, the terminal cost is paid at the end.
-        With pushes it must be a Solution, which knows where they are optimal. A path that starts in the push region
-        jumps to its boundary at once, after the first entry of ``states``. Later it is moved back to the boundary after
-        every internal step, of equal lengths as with noise: its law has order ½ in this step, its mean cost order 1.
+        function that returns the control, shape (m,). ``None`` if there is no control. With a Solution of a problem
+        with a stopping cost, the path ends and pays ψ where stopping is optimal, that is where V = ψ at all surrounding
+        nodes. Without a running cost, pushes, changes of the mode by choice, and noise it continues, and its cost is
+        the cost of the best moment to stop. A marched Solution must be stored at enough times: at least ten over the
+        duration. A path as long as the horizon pays at its end what ``march`` assumed there: ``start``, the terminal
+        cost, else ψ, else g. If the feedback is a function, the terminal cost is paid at the end. With pushes it must
+        be a Solution, which knows where they are optimal. A path that starts in the push region jumps to its boundary
+        at once, after the first entry of ``states``. Later it is moved back to the boundary after every internal step.
+        The steps have equal lengths, as with noise: the law of the path has order ½ in the step, and the mean cost has
+        order 1.
       x0: the state at time 0, shape (n,).
       duration: the length of the path unless it reaches the target earlier, in units of time.
 
@@ -391,7 +391,8 @@ def _is_marched(feedback: object) -> TypeGuard[GridFeedback]:
 
 
 def _due(feedback: Feedback, duration: float) -> str:
-    """The payment at the end of a path: V at the horizon of a march, if the path is as long; see ``Loop``.
+    """The payment at the end of a path: V at the horizon of a march, if the path is as long as the horizon; see
+    ``Loop``.
 
     Raises:
       ValueError: a marched feedback that is not stored at enough times up to the duration.

@@ -91,8 +91,8 @@ class GridFilter:
     measurement: Measurement
     signal: Any  # r⁻¹ h at the nodes, (p, *grid)
     prior: Any  # the density at t = 0, (*grid)
-    volumes: Any  # of the nodes, (*grid)
-    cells: Any  # of the chain's law, (*grid)
+    volumes: Any  # volumes of the nodes, (*grid)
+    cells: Any  # cells of the chain's law, (*grid)
     axes: tuple[int, ...]  # where the noise is too small for central differences, see ``markov_chain.transport``
 
     @front_door

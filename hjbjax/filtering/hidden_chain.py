@@ -25,7 +25,7 @@ from hjbjax.problem.pytree import as_jax, as_partial, cast, front_door, is_trace
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, Key, Number, Numbers, Scalar
 
-TERMS = 19  # of the Taylor series: 1/19! is below the rounding of float64 if q dt ≤ 1
+TERMS = 19  # terms of the Taylor series: 1/19! is below the rounding of float64 if q dt ≤ 1
 
 
 def transition_matrix(rates: Array, dt: Number) -> jax.Array:

@@ -36,7 +36,7 @@ from hjbjax.problem.types import Array, Field, Nodes, Number, Scalar
 MOST = (
     100_000  # inner steps: a path crosses up to this number of cells, more than any sensible interval of a record needs
 )
-FRACTION = 0.8  # of the monotone step limit, because later stages may have larger velocities than the first
+FRACTION = 0.8  # fraction of the monotone step limit, because later stages may have larger velocities
 
 
 @pytree_dataclass()

@@ -41,7 +41,7 @@ from hjbjax.problem.types import Array, Control, Number, Numbers, State
 __all__ = ["ExtendedKalman", "Gaussian", "Luenberger", "Observer", "affine_flow"]
 
 SHORT = 0.25  # |F| t of the short piece: the terms of the series of Q then fall like ½^j/j!
-TERMS = 14  # of the series: the remainder is ½^15/15!, 2e-17
+TERMS = 14  # terms of the series: the remainder is ½^15/15!, 2e-17
 DOUBLINGS = 64  # at most: a piece 2^64 times shorter than the step is below rounding
 ROUNDINGS = 64  # units of eps: the rounding error allowed in the symmetry and the zero eigenvalues of a covariance
 

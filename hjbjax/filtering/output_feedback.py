@@ -24,7 +24,7 @@ from hjbjax.filtering.output_loop import (
 )
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, check_constant_discount
 from hjbjax.problem.pytree import altered, as_partial, cast, front_door, is_traced, numbers
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
@@ -192,16 +192,7 @@ def _plant(problem: Problem, observer: Observer, n: int) -> Problem:
         what = "disturbances" if problem.is_game else "a running_max"
         fix = "use noise instead" if problem.is_game else "leave it out, and take the maximum along path.states"
         raise ValueError(f"simulate_output: got a problem with {what}, wanted one player and a running cost; {fix}")
-    if callable(problem.discount):
-        raise ValueError(
-            "simulate_output: got a discount that is a function of the state, wanted a number; make ∫ discount dt a "
-            "state z with z(0) = 0, and multiply the costs by exp(−z)"
-        )
-    if problem.growth is not None:
-        raise ValueError(
-            "simulate_output: got a problem with growth, wanted one without; make ∫ (discount - growth) dt a state z "
-            "with z(0) = 0, and multiply the costs by exp(−z)"
-        )
+    check_constant_discount(problem, "simulate_output")
     missing = [name for name in ("initial", "update", "estimate") if not callable(getattr(observer, name, None))]
     if missing:
         raise TypeError(

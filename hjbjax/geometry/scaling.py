@@ -78,7 +78,7 @@ def _changeable(value: Array, slopes: Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _own_or_beside(numbers: Array, beside: Array) -> jax.Array:
-    """The sizes of numbers, replaced by the sizes ``beside`` for numbers that are rounding in comparison."""
+    """The sizes of numbers. A number that is only rounding compared with the size in ``beside`` gets that size."""
     size = jnp.abs(numbers)
     # zeros are exact; a number this small is cos(π/2) or 0.1 + 0.2 − 0.3 and not an effect of units
     return jnp.where((size > 0) & (size < NEGLIGIBLE * jnp.finfo(size.dtype).eps * beside), beside, size)

@@ -32,7 +32,7 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Verdict
 from hjbjax.tracing import components
 
-ROUNDING = 16  # units of rounding of a total, below which an input that is the rest of the total counts as zero
+ROUNDING = 16  # rounding units of the total: a smaller remainder of the total counts as zero
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,7 @@ from hjbjax.problem.pytree import altered, tie
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex
 from hjbjax.problem.types import Field
 
-INNER = 8  # actions of the player who moves second to write out, inside the search of the first player
+INNER = 8  # actions of the second player that are written out inside the search of the first player
 
 
 def optimise(hamiltonian: DiscreteHamiltonian, isaacs: str | None = None) -> tuple[jax.Array, Action, Action]:

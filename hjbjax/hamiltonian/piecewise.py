@@ -113,9 +113,10 @@ def piecewise_pair(
 ) -> list[jax.Array]:
     """The exact optimum over two inputs of  l·u + q₁u₁² + q₂u₂² + Σ_i gain_i(b_i + G_i·u)  in a box.
 
-    The lines on which a gain has its kink cut the box into cells, in each of which the objective is one quadratic.
-    Its optimum in a cell is its stationary point, or is on the boundary, that is on a side of the box or on a line,
-    where the problem has a single input. All are tried; every candidate is admissible and compared by its own value.
+    Every kink of a gain is a line. These lines divide the box into cells, and the objective is one quadratic in each
+    cell. Its optimum in a cell is its stationary point, or is on the boundary, that is on a side of the box or on a
+    line, where the problem has a single input. All are tried; every candidate is admissible and compared by its own
+    value.
 
     Args:
       sign: +1 to minimise, −1 to maximise.
@@ -170,7 +171,7 @@ def piecewise_pair(
     if len(cells) > UNROLLED:
         corner = clipped([lo[0], lo[1]])
         best: Candidate = corner, jnp.asarray(total(corner))
-        # as on a side: a gain that is constant along its own line is harmless, and all lines share one computation
+        # one computation for all lines, including the line of the gain itself, along which this gain is constant
         lines = [_kink_line(piece, kink) for piece in pieces for kink in piece.kinks]
         sides += [(tuple(point), tuple(way), _within(point, way, lo, hi)) for point, way in lines]
         for candidate, entries in ((on_side, sides), (in_cell, cells)):

@@ -35,7 +35,7 @@ import numpy as np
 
 from hjbjax.problem.pytree import altered, pytree_dataclass
 
-STEPS = 40  # of the interior-point method; most nodes need 15, and the slowest of 100,000 random ones needed 27
+STEPS = 40  # interior-point steps; most nodes need 15, and the slowest of 100,000 random ones needed 27
 POLISH = 3  # Newton steps on the active set: the penalty makes each multiply the error by the square root of rounding
 CLOSE = 16  # units of rounding of the largest coefficient at which a node has converged
 DESCENTS = 12  # convex programs with tangents at the best point, if a cost is not convex

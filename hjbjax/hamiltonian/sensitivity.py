@@ -36,7 +36,7 @@ from hjbjax.problem.types import Field
 # further counts as held.
 STATIONARY = 4
 
-Row: TypeAlias = tuple[dict[int, Any], Any]  # of a linear system at every node: entries by column, and right-hand side
+Row: TypeAlias = tuple[dict[int, Any], Any]  # of a linear system at every node: entries by column, right-hand side
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +184,7 @@ def _rows(at: Optimum, inputs: Sequence[Input], slopes: Sequence[Field], bends: 
         for a, (row, (_, end), g) in enumerate(zip(columns, ends, slopes, strict=True))
     ]
     for place, rim in enumerate(rims.values(), len(inputs)):
-        # the rim says nothing about inputs that are all held
+        # the rim does not matter if all inputs are held
         free = (~held[k] & ~kinks.hold(k) & (abs(entry) > 0) for k, entry in rim.entries.items())
         on = rim.on & functools.reduce(jnp.logical_or, free)
         around = {k: jnp.where(on, entry, 0) for k, entry in rim.entries.items()} | {place: jnp.where(on, 0.0, 1.0)}

@@ -39,7 +39,7 @@ from hjbjax.problem.types import Field, Mask, Number, Scalar
 
 Map: TypeAlias = Callable[[Field], Field]  # maps node values to node values
 LinearSolve: TypeAlias = Callable[[Map, Field], Field]  # from a matrix-free product and the right-hand side
-Actions: TypeAlias = tuple[Action, Action]  # of the control and of the disturbance
+Actions: TypeAlias = tuple[Action, Action]  # an action of the control and one of the disturbance
 Refinement: TypeAlias = tuple[Field, Field, Scalar, Scalar]  # δ, residual, previous size, steps
 
 STEPS = 200  # largest number of refinements of the linear solve in each of its two stages

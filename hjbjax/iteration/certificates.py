@@ -190,7 +190,7 @@ def _multiplicative(iterate: Iterate, least_cost: Field, residual: Scalar) -> Er
     priced = layout.largest(jnp.asarray(free & ~costs, value.dtype)) == 0
     sound = priced & (1 - rho > jnp.sqrt(jnp.finfo(rho.dtype).eps))  # where V is flat, r = L up to rounding
     below, above = 1 / (1 + eta), jnp.where(sound, 1 / jnp.where(sound, 1 - rho, 1), jnp.inf)
-    if obstacles.interventions.pushes:  # scaling V scales c + V(x + o) the right way only for c ≥ 0
+    if obstacles.interventions.pushes:  # the bound for scaled V requires c ≥ 0
         least_push = functools.reduce(jnp.minimum, map(jnp.min, obstacles.interventions.costs))
         sound, priced = sound & (least_push >= 0), priced & (least_push >= 0)
     lift = jnp.maximum(-lowest_end(obstacles, counted, layout), 0)
@@ -244,7 +244,7 @@ def lowest_end(obstacles: Obstacles, counted: Mask | bool, layout: Layout) -> Sc
     return jnp.minimum(lowest, layout.least(jnp.where(counted, obstacles.upper, 0)))
 
 
-def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = None) -> Any:
+def affine_bounds(kind: Certificate, bound: ErrorBound, discount: Number | None = None) -> Any:
     """Both bounds as affine functions of V: rows lower and upper, columns factor and shift, shape (2, 2).
 
     (V + lift) · factor − lift cancels where V is near −lift, as on a target with a negative exit cost. The shift is
@@ -252,7 +252,7 @@ def enclosure(kind: Certificate, bound: ErrorBound, discount: Number | None = No
     """
     if kind is Certificate.BY_DISCOUNT:
         assert discount is not None
-        with_it, without = (enclosure(each, bound) for each in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
+        with_it, without = (affine_bounds(each, bound) for each in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE))
         return jnp.where(discount > 0, with_it, without)
     if kind not in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
         return None

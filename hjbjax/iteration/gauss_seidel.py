@@ -35,7 +35,7 @@ from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Field, Scalar
 
-Index: TypeAlias = int | Scalar  # of a slice; traced inside a loop
+Index: TypeAlias = int | Scalar  # index of a slice; traced inside a loop
 
 CACHE = 2**25  # bytes of the processor's cache
 SLAB = 64  # slices swept back and forth while they are in the cache

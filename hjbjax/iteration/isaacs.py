@@ -44,7 +44,7 @@ def weight_of_actions(hamiltonian: discrete.DiscreteHamiltonian, free: Mask, upp
     pairs = jnp.asarray([(i, j) for i in range(len(mine)) for j in range(len(theirs))])
     # one pair at a time: all 81 at once would store 81 arrays
     (least, most), _ = jax.lax.scan(compare, (lower, upper), pairs)
-    size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # a gap is at least rounding
+    size = 1e3 * jnp.finfo(dtype).eps * (jnp.abs(least) + jnp.abs(most))  # a gap below rounding means nothing
     return hamiltonian.on.grid.layout.largest(jnp.where(free, most - least + size, 0))
 
 

@@ -7,14 +7,13 @@ import numpy as np
 from hjbjax.linear_games.convex import Largest, Quadratic
 from hjbjax.linear_games.linear_dynamics import LinearGame
 from hjbjax.problem.sets import Ball, Box, Finite, Simplex
-from hjbjax.solution.files import Expected, FileError
+from hjbjax.solution.files import FileError
 
 MATRICES = ("drift", "constant", "own", "other")
 SETS = ("own_set", "other_set", "effective")
-SHAPES = (*(((None,) * axes) for axes in range(3)),)
 
 
-def contents(game: LinearGame) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def game_contents(game: LinearGame) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a game.
 
     Raises:
@@ -40,11 +39,6 @@ def contents(game: LinearGame) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             "solution.on_grid(grid), or build the solution again"
         )
     return header, arrays | {f"terminal.{key}": np.asarray(value, float) for key, value in own.items()}
-
-
-def plan(header: dict) -> dict[str, Expected]:
-    """The arrays of a file; their shapes are checked when the game is rebuilt."""
-    return {name: Expected(SHAPES, (np.float64,)) for name in header["arrays"] if name != "header"}
 
 
 def rebuild(header: dict, arrays: dict[str, np.ndarray]) -> LinearGame:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from hjbjax.problem.types import Array, Number
 
-ROUNDS = 30  # of Newton's method for the scalar equation, which converges monotonically
+ROUNDS = 30  # steps of Newton's method for the scalar equation, which converges monotonically
 
 
 def over_interval(z: Array, mu: Number) -> tuple[Array, Array]:

@@ -31,7 +31,7 @@ NEAR = 0.1  # Newton's predicted gain, in units of μ, at which μ falls
 STEPS = 200  # the largest number of Newton steps; ten to sixty are usual
 SHORTEST = 2.0**-12  # the shortest step of a line search
 FINER = 8  # nodes of the integral per interval of the control
-TERMS = 17  # of a Taylor series: 1/18! is below the rounding of float64
+TERMS = 17  # terms of a Taylor series: 1/18! is below the rounding of float64
 REPLIES = 30  # best responses of the disturbance that are computed where the Hamiltonian is not convex
 
 

@@ -63,7 +63,7 @@ def generator(
         modes have a switching cost.
     """
     jumps = policy_rates.rates_under(problem, grid, policy, disturbance, scheme, t)
-    return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid, jumps.landings)
+    return laws.sparse_generator(jumps, grid)
 
 
 @with_mode_axis()
@@ -221,8 +221,8 @@ def evolve(
       scheme: the chain that defines the rates.
 
     Returns:
-      The laws, shape (number of times, *grid); in NumPy at host level. Inside ``jit`` and ``vmap`` they are traced, and
-      forward derivatives, as of ``jax.jvp`` and ``jax.jacfwd``, pass. ``horizon`` and all times must be known numbers.
+      The laws, shape (number of times, *grid); in NumPy at host level. Inside ``jit`` and ``vmap`` they are traced.
+      They have forward derivatives (``jax.jvp`` and ``jax.jacfwd``). ``horizon`` and all times must be known numbers.
       The result is NaN there if ``generator`` would raise.
 
     Raises:
@@ -326,7 +326,7 @@ def _stationary(name: str, problem: Problem, grid: Grid, policy: Any, disturbanc
     if is_traced(problem, grid, policy, disturbance, t):
         return _stationary_traced(problem, grid, policy, disturbance, scheme, t)
     jumps = policy_rates.rates_under(problem, grid, policy, disturbance, scheme, t)
-    moves = stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid, jumps.landings)
+    moves = laws.sparse_generator(jumps, grid)
     return decision_process.single_law(moves, grid, name).reshape(grid.shape)
 
 

@@ -162,7 +162,7 @@ def after_duration(jumps: Rates, grid: Grid, law: Field, duration: Number) -> Fi
     return found * jnp.where(after > 0, before / jnp.where(after > 0, after, 1), 1)
 
 
-def generator(jumps: Rates, grid: Grid) -> "csr_array":
+def sparse_generator(jumps: Rates, grid: Grid) -> "csr_array":
     """The generator of known rates as a sparse matrix; host level."""
     return stencil.sparse(jumps.offsets, jumps.values, -jumps.total(), grid, jumps.landings)
 
@@ -177,7 +177,7 @@ def implicit_step(jumps: Rates, grid: Grid, duration: float) -> "SuperLU":
     from scipy.sparse import eye_array
     from scipy.sparse.linalg import splu
 
-    matrix = (eye_array(grid.size) - duration * generator(jumps, grid).T).tocsc()
+    matrix = (eye_array(grid.size) - duration * sparse_generator(jumps, grid).T).tocsc()
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
@@ -236,4 +236,4 @@ def _generator(jumps: Rates, grid: Grid, leaves: tuple[np.ndarray, ...]) -> Any:
     """The generator of ``jumps`` with these numbers as its leaves, on the host."""
     numbers = [leaf.astype(np.float64) if leaf.dtype.kind == "f" else leaf for leaf in map(np.asarray, leaves)]
     known = jax.tree.unflatten(jax.tree.structure(jumps), numbers)
-    return generator(known, grid)
+    return sparse_generator(known, grid)

@@ -39,16 +39,16 @@ from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status
 
 NAME = "neural.solve"
-FLOOR = 0.01  # of the mean size of the terms: below it a residual counts relative to this size
+FLOOR = 0.01  # fraction of the mean size of the terms: the least scale of a residual
 HELD_OUT, FRESH = 1024, 4 * 1024  # states that choose the best weights, and states of the final residual
-EXPONENTS, HALVINGS = (-15.0, 15.0), 44  # of the cost per unit of the target function, in any units, as powers of ten
+EXPONENTS, HALVINGS = (-15.0, 15.0), 44  # cost per unit of the target function, in any units, as powers of ten
 CHOOSING = 4  # held-out extremals, at most, that choose the best weights; the others only validate
 CANDIDATES = 64  # random states per extremal; the one with the largest residual is its start
 ROUNDS = 4  # in which the extremals are computed, half of them before the training
-WARM = 0.25  # of the steps, over which the weight of the residual grows from zero to one
-POINTS = 128  # of extremals in a batch
+WARM = 0.25  # fraction of the steps over which the weight of the residual grows from zero to one
+POINTS = 128  # points of extremals in a batch
 ENOUGH = 1e-6  # relative residual of a value that needs no training, such as the linear-quadratic one
-BIAS = 0.5  # of a network that has to learn the quadratic part
+BIAS = 0.5  # bias of a network that has to learn the quadratic part
 
 
 @pytree_dataclass(static=("rule",))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hjbjax.feedback.path import Path
     from hjbjax.solution.solution import Solution
 
-JUMPS = 14  # jumps of one control back and forth; of more the mean says more
+JUMPS = 14  # if a control jumps more often, its running mean is drawn
 WINDOW = 0.04  # fraction of the duration, the width of the running mean for such a control
 
 

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-OPACITY = 0.55  # of a surface, so that objects behind it are visible
+OPACITY = 0.55  # opacity of a surface, so that objects behind it are visible
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +104,7 @@ def zero_level_set(
       1
     """
     field = _projection(_field(solution, inside, time), project)
-    # by name, because a projection removes axes and renumbers the others
+    # axes by name, because a projection removes axes and renumbers the others
     cuts = {field.grid.names[axis_number(key, field.grid)]: place for key, place in dict(fixed or {}).items()}
     if field.grid.ndim - len(cuts) == 3:
         return _surface(field, cuts, solid_axes(ax), color, label)

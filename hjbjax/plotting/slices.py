@@ -221,7 +221,7 @@ def section_of(
         raise ValueError(
             f"{what}: got a field of shape {field.shape} on a grid of shape {grid.shape}; draw one lane at a time"
         )
-    cuts: dict[int, float] = {}  # by number, because an axis may be given both by name and by number
+    cuts: dict[int, float] = {}  # keys are numbers, because an axis may be given both by name and by number
     for key, place in dict(fixed or {}).items():
         axis = axis_number(key, grid)
         if axis in cuts:

@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from hjbjax.problem.types import Array, AtNodes, Mask, Scalar, Verdict
 
 T = TypeVar("T")
-FEWEST = 3  # nodes of a part along a divided axis: the reach of Weno5 and of a parabola beyond an end
+FEWEST = 3  # least number of nodes of a part along a divided axis, because Weno5 reads this many neighbours
 
 
 @jax.tree_util.register_static

@@ -269,6 +269,19 @@ def is_discounted(problem: Problem) -> bool | None:
     return bool(np.all(np.asarray(problem.discount) > 0))  # a batch has one discount per problem: all must be positive
 
 
+def check_constant_discount(problem: Problem, caller: str) -> None:
+    """Refuse a discount or a growth that depends on the state; ``caller`` is the function that the user called."""
+    if callable(problem.discount):
+        got, rate = "a discount that is a function of the state, wanted a number", "discount"
+    elif problem.growth is not None:
+        got, rate = "a problem with growth, wanted one without", "(discount - growth)"
+    else:
+        return
+    raise ValueError(
+        f"{caller}: got {got}; make ∫ {rate} dt a state z with z(0) = 0, and multiply the costs by exp(−z)"
+    )
+
+
 def known_sign(discount: Callable | Number) -> bool | None:
     """True if a discount is positive, also for a function; None for a traced number."""
     return callable(discount) or (None if is_traced(discount) else bool(discount > 0))

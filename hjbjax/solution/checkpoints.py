@@ -33,7 +33,7 @@ from hjbjax.tracing import closures
 from hjbjax.tracing.outside import ADDRESS
 
 FORMAT, VERSION = "hjbjax.Checkpoint", 1
-SECONDS = 60.0  # between two writes
+SECONDS = 60.0  # seconds between two writes
 KINDS = tuple(map(np.dtype, ("f8", "f4", "i8", "i4", "u4", "u1", "?")))  # of the arrays in a state
 # the statuses of an incomplete part, from which a later run continues
 CUT_SHORT = (Status.INTERRUPTED, Status.TIME_LIMIT, Status.MAX_STEPS, Status.RUNNING)

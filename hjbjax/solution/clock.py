@@ -23,7 +23,7 @@ import numpy as np
 from hjbjax.solution.status import Status
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-CHUNK_SECONDS = 0.5  # between two checks of the clock if steps are short, and so the delay of Ctrl-C
+CHUNK_SECONDS = 0.5  # seconds between two checks of the clock if steps are short: the delay of Ctrl-C
 REPEAT = 1.0  # seconds within which SIGTERM is sent twice: by a service manager to all processes, and by their launcher
 CUT = (Status.INTERRUPTED, Status.TIME_LIMIT)
 

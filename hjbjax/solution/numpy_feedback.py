@@ -63,7 +63,7 @@ class Feedback:
         self._lo, self._hi, self._span, self._periodic = lo, hi, np.where(hi > lo, hi - lo, 1), periodic
         self._counts = np.array([len(nodes) for nodes in self._nodes])
         self._last = self._counts - 1 + periodic  # intervals per axis
-        self._scale = np.where(uniform, self._last, 1.0)  # a place is counted in cells, or in lengths of the axis
+        self._scale = np.where(uniform, self._last, 1.0)  # the units of a position: cells, or the length of the axis
         self._top = np.where(hi > lo, self._scale, 0.0)  # the place of the last node; 0 if only one time is stored
         size = np.maximum(np.abs(lo), np.abs(hi)) / self._span
         self._slack = np.where(uniform, 8 * EPS * self._last * np.maximum(1, size), 64 * EPS * np.maximum(1, size))

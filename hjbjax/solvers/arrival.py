@@ -25,7 +25,7 @@ from hjbjax.tracing import components
 
 PATHS = 64  # largest number of paths
 LONG = 20  # legs per path, times the number of nodes summed over the axes: about 20 crossings of the box
-PROMISED = 0.05  # fraction of the largest reward: where less is promised, resting is equally good
+PROMISED = 0.05  # fraction of the largest reward: where V promises less, resting is equally good
 SHARE = 0.1  # fraction of the paths: if more never arrive, warn
 
 

@@ -137,12 +137,7 @@ def solve_batch(
         checkpoint, lanes, grid, resume=resume, caller="solve_batch", method=method, scheme=scheme, tol=tol, dtype=kind
     )
     free_tol, tol = tol is None, TOL if tol is None else tol
-    with (
-        noting_interrupts(clock),
-        host_loop.announce(clock),
-        own_settings(x64=kind == np.float64),
-        opened as kept,
-    ):
+    with noting_interrupts(clock), host_loop.announce(clock), own_settings(x64=kind == np.float64), opened as kept:
         for members in _same_program(lanes):
             first = lanes[members[0]]
             # without nesting, because the host would drive the levels of each lane

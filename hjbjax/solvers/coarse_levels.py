@@ -55,7 +55,7 @@ def first_guess(
     asked_again &= scheme.monotone or staged(task, scheme) is not task
     coarser = levels(task, method, clock, asked_again=asked_again)
     if coarser:
-        coarser[-1] = staged(coarser[-1], scheme)  # the one that is asked again
+        coarser[-1] = staged(coarser[-1], scheme)  # the level whose solution is read again
     grids, answer = [*(level.grid for level in coarser), task.grid], None
     for level, finer in zip(coarser, grids[1:], strict=True):
         state, code, _ = iterate(level, warm(level, value, clock), clock)
@@ -133,10 +133,10 @@ def on_coarser(task: Task, coarse: Grid) -> Task | None:
         bare: Any = dataclasses.replace(task, on=None, obstacles=obstacles)  # type: ignore[arg-type]
         known = jax.tree.map(lambda leaf: np.asarray(leaf)[every] if np.shape(leaf) == fine.shape else leaf, bare)
         on = task.on.on_grid(coarse)
-        if stores_links(on):  # those of the chain, which its own level on this grid needs too
+        if stores_links(on):  # arrays of the chain, which its own level on this grid needs too
             on = _with_links(on.chain).with_scheme(on.scheme)
         made = dataclasses.replace(known, on=on)
-    elif task.has_lost:  # whether nodes in between reach the target is not known
+    elif task.has_lost:  # it is not known if nodes in between reach the target
         return None
     else:
         level = task.on.chain.on_grid(coarse)

@@ -111,12 +111,12 @@ def _of_task(task: Task, state: State) -> dict[str, Any]:
 def _gaining(task: Task, state: State, stopping: jax.Array) -> jax.Array:
     """The nodes with V = ψ, up to the tolerance, from which continuing at no loss leads to a node that continues."""
     on, policy, grid = task.on.chain, state.policy, task.grid
-    if not task.scheme.monotone:  # slopes of high order overshoot where V is small, and continuing seems to cost
+    if not task.scheme.monotone:  # high-order slopes overshoot where V is small, so continuing seems to cost something
         policy = bellman.greedy(on, state.value, task.obstacles.fixed)
     rates = jump_rates(on, list(policy.controls), list(policy.disturbances))
     rounding = ROUNDING * jnp.finfo(state.value.dtype).eps * (rates.total() + on.decay) * jnp.abs(state.value)
     free = ~task.obstacles.fixed
-    # r per unit time is lost by continuing: r/β in all
+    # continuing loses r per unit time, r/β in total
     indifferent = stopping & free & (policy.defect <= jnp.maximum(rounding, on.decay * task.tol))
 
     def spread(continuing: jax.Array) -> jax.Array:

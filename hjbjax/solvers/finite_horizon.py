@@ -166,12 +166,7 @@ def march(
         times=kept, start=start, method=method, scheme=scheme, step=step, inner=inner, policy=policy, dtype=kind,
     )  # fmt: skip
     # float64 for this call only: the caller's own programs, and other threads, keep their type
-    with (
-        noting_interrupts(clock),
-        host_loop.announce(clock),
-        own_settings(x64=kind == np.float64),
-        opened as file,
-    ):
+    with noting_interrupts(clock), host_loop.announce(clock), own_settings(x64=kind == np.float64), opened as file:
         clock.journal = file and file.journal()
         # within a second: errors visible at a single state, and a grid that does not fit
         check_on_one_state(problem, grid, scheme)

@@ -259,7 +259,7 @@ def _enclosure(task: Task, state: State, assumptions: Assumptions) -> Any:
     if task.problem.growth is not None:  # a constant shift of V changes the residual by at least the discount
         xp: Any = jnp if traced else np
         bound = dataclasses.replace(bound, below=xp.minimum(bound.below, 0), above=xp.maximum(bound.above, 0))
-    return certificates.enclosure(kind, bound, discount)
+    return certificates.affine_bounds(kind, bound, discount)
 
 
 @functools.partial(jax.jit, static_argnames="kind")

@@ -59,7 +59,7 @@ def better_of(settled: Settled, sharp: Settled, clock: Clock, *, sharpen: bool) 
 
 def _better_of(settled: Settled, sharp: Settled, clock: Clock) -> Settled:
     """The choice of ``better_of`` if the caller left it; the monotone solution may lack its actions."""
-    settled = sharp.origin or settled  # with its answer on the coarser grid
+    settled = sharp.origin or settled  # together with its answer on the coarser grid
     if sharp.code is not Status.CONVERGED:
         # Ctrl-C leaves the solve unfinished; after a time limit the monotone answer is complete
         code = sharp.code if sharp.code is Status.INTERRUPTED else settled.code

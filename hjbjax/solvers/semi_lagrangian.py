@@ -296,7 +296,7 @@ def finish_arcs(followed: Followed) -> Solution:
     solution = solution_at_start(on, value, code)
     solution = dataclasses.replace(
         solution, policy=policy, message=message, reached=reached, cut=leaving, steps=state.progress.steps,
-        residuals=residuals, enclosure=certificates.enclosure(task.certificate, state.bound) if looked else None,
+        residuals=residuals, enclosure=certificates.affine_bounds(task.certificate, state.bound) if looked else None,
         discrete=isinstance(problem.controls, Finite), **touching,
     )  # fmt: skip
     solution.stats["certificate"] = WORDS[task.certificate] + "; over the arcs of the scheme"

@@ -279,7 +279,7 @@ def prepare_on_host(
         return *_bare(on, method, tol, assumptions, mesh), None
     task = prepared(on, method=method, tol=tol, assumptions=assumptions, mesh=mesh)
     priced = assumptions.certificate is Certificate.MULTIPLICATIVE
-    # where L = 0 the bound by the running cost fails, and a run may cycle indefinitely at no cost, as well as rest
+    # where L = 0 the bound by the running cost fails, and a run may rest, or cycle, indefinitely at no cost
     if (priced and not _costs_positive(task)) or problem.cost is None:
         task = _with_refuge(task)
         assumptions = dataclasses.replace(

@@ -37,9 +37,6 @@ from hjbjax.solvers.transformed import Asked
 from hjbjax.tracing import checks
 from hjbjax.tracing.closures import with_settled_functions
 
-# inside a transformation the steps are not monitored: a limit far above the steps of policy iteration
-TRACED_STEPS = 10_000
-
 
 @with_rewards
 @without_horizon
@@ -147,12 +144,7 @@ def solve(
     choices = Choices(scheme=scheme is None, method=free, levels=free, tol=tol is None)
     tol = TOL if tol is None else tol
     if scheme is not None and paths is not None:
-        with (
-            noting_interrupts(clock),
-            host_loop.announce(clock),
-            own_settings(x64=kind == np.float64),
-            opened as kept,
-        ):
+        with noting_interrupts(clock), host_loop.announce(clock), own_settings(x64=kind == np.float64), opened as kept:
             clock.journal = kept and kept.journal()
             options: Any = {"method": method, "tol": tol, "guess": guess, "max_memory": max_memory}
             solution = semi_lagrangian.solve_arcs_on_host(problem, grid, scheme, paths, kind, clock=clock, **options)
@@ -160,12 +152,7 @@ def solve(
     method = choose(problem, grid, traced=False, method=method, divided=mesh is not None)
     on = Discretisation(problem, grid, scheme or Upwind(subcell=True), kind)
     # float64 for this call only: other threads, and the caller's own programs, keep their type
-    with (
-        noting_interrupts(clock),
-        host_loop.announce(clock),
-        own_settings(x64=kind == np.float64),
-        opened as kept,
-    ):
+    with noting_interrupts(clock), host_loop.announce(clock), own_settings(x64=kind == np.float64), opened as kept:
         clock.journal = kept and kept.journal()
         check_on_one_state(problem, grid, on.scheme)  # before the memory check, which reads functions
         needed = memory.require(

@@ -255,7 +255,7 @@ def _calls_back(task: Task) -> bool:
     return (evaluation is not None and evaluation.calls_back) or checks.problem_calls_back(task.problem, task.grid.ndim)
 
 
-class Rows(NamedTuple):
+class LaneRows(NamedTuple):
     """The rows of the arrays in which lanes run together; a single value, so that interrupts find it consistent."""
 
     lanes: np.ndarray  # the lane of each row; −1 in padding rows
@@ -274,7 +274,7 @@ class LanesRun:
         states, lanes = _start(tasks, starts), np.arange(over.filled(count))
         if lanes.size > count:  # every device has the same number of rows
             (tasks, states), lanes = _take((tasks, states), lanes % count), np.where(lanes < count, lanes, -1)
-        self.rows = Rows(lanes, *over.spread((tasks, states)), np.zeros(lanes.size, int))
+        self.rows = LaneRows(lanes, *over.spread((tasks, states)), np.zeros(lanes.size, int))
         self.limit, self.steps = limit, 0
         self.final: list[Any] = [None] * count  # the last state and the status of each lane
         self.histories: list[list] = [[np.zeros(0)] for _ in range(count)]
@@ -349,7 +349,7 @@ class LanesRun:
             both = rows.tasks, rows.states
             if over.mesh is not None:  # through the host, because rows move to other devices
                 both = over.gathered(both)
-            rows = Rows(lanes, *over.spread(_take(both, kept)), before)
+            rows = LaneRows(lanes, *over.spread(_take(both, kept)), before)
         self.rows = rows._replace(before=before)
 
     def show(self, bar: Any) -> None:

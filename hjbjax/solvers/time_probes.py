@@ -24,7 +24,7 @@ from hjbjax.problem.sets import AdmissibleSet
 from hjbjax.problem.types import Array, DType
 from hjbjax.solution.status import warn
 
-PARTS = 100  # of the horizon, each at least one step
+PARTS = 100  # parts of the horizon, each at least one step long
 CUTS = (1, 2, 4, 8, 16, 32, 64)  # numbers of steps per part
 PLACES = 6  # states, each with its own actions
 INTEGRATED = ("drift", "cost", "noise", "growth", "killing")  # the last is a function of the state

@@ -1,7 +1,8 @@
 """The start of an undiscounted solve: the solutions for vanishing discounts.
 
-If an undiscounted problem is iterated from zero, its policies stay where they are, at a cost. With a small discount
-they move to the target. A stopping cost or a running maximum is a start itself: ψ is above all fixed points, g below.
+If an undiscounted problem is iterated from zero, its policies do not move, although staying has a cost. With a small
+discount they move to the target. A stopping cost or a running maximum is a start itself: ψ is above all fixed points, g
+below.
 """
 
 import numpy as np

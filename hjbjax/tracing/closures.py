@@ -179,7 +179,8 @@ class Marked:
     """A function with a mark of what it computes, and with the jaxprs of its traces.
 
     It equals another with the same code and the same mark, so a lambda in a loop or a notebook cell that is run again
-    does not recompile. Different functions may share a mark that is not ``whole``; then a function equals only itself.
+    does not recompile. A mark that is not ``whole`` may belong to several functions. A function with such a mark equals
+    only itself.
 
     Python runs the function once for every kind of arguments. A solve uses it in about six places (checks, dependence
     on the control, the chain, slopes of the drift in u), and each would otherwise trace it again.

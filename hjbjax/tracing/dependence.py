@@ -227,7 +227,7 @@ class _Polynomials(Algebra):
             return operands[0] | operands[1]
         if name == "mul":
             return _product(*operands)
-        if name == "div" and operands[1] == CONSTANT:  # by a number free of inputs; u₀/u₁ is not a polynomial
+        if name == "div" and operands[1] == CONSTANT:  # u₀/u₁ is not a polynomial
             return operands[0]
         if name == "square" or (name == "integer_pow" and params["y"] == 2):
             return _product(operands[0], operands[0])

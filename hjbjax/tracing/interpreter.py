@@ -37,7 +37,7 @@ from hjbjax.tracing.stacks import RULES, Stack, is_components, object_array, var
 if TYPE_CHECKING:
     from jax.extend import core as jex
 
-Operand: TypeAlias = Numbers  # of an equation: an object array of scalars, or numbers that hold at all nodes
+Operand: TypeAlias = Numbers  # operand of an equation: an object array of scalars, or numbers that hold at all nodes
 
 
 class FallbackWarning(UserWarning):
@@ -176,7 +176,7 @@ def _move(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list[np.ndarra
     data = set(MOVES[eqn.primitive.name](len(operands)))
     if not _are_known([value for position, value in enumerate(operands) if position not in data]):
         return None
-    pool: list[Any] = []  # label k represents the entry pool[k], from any of the operands
+    pool: list[Any] = []  # label k stands for the entry pool[k] of some operand
     labelled = list(operands)
     for position in sorted(data):
         entries = lift(operands[position], algebra)

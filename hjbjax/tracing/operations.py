@@ -96,7 +96,7 @@ def _by_entries(eqn: jex.JaxprEqn) -> int:
     if name in SCATTERS:
         return array_type(eqn.invars[2]).size
     size = sum(array_type(var).size for var in eqn.outvars)
-    if name == "dot_general":  # a product and a sum for every entry along the contracted axes
+    if name == "dot_general":  # each entry takes one product and one sum per index of the contracted axes
         (contracted, _), _ = eqn.params["dimension_numbers"]
         return 2 * size * math.prod(array_type(eqn.invars[0]).shape[axis] for axis in contracted)
     return size if name in ENTRYWISE else 1

@@ -94,7 +94,7 @@ def _identity_of_function(function: types.FunctionType, depth: int) -> Hashable 
         each if _is_library(each) else identity(each, depth - 1) if isinstance(each, types.FunctionType) else None
         for each in outside
     ]
-    # by repr, since 0.0 equals −0.0 and True equals 1; code objects compare their constants by type and bits
+    # compare by repr, since 0.0 equals −0.0 and True equals 1; code objects compare constants by type and bits
     return None if None in found else (function.__code__, repr(function.__defaults__), tuple(found), tuple(cells))
 
 

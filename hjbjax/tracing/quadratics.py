@@ -41,7 +41,9 @@ class Polynomial(dict[tuple[int, ...], Form]):
     def __neg__(self) -> Polynomial:
         return Polynomial({term: -each for term, each in self.items()})
 
-    def __mul__(self, other: Polynomial) -> Polynomial:
+    def __mul__(self, other: Polynomial | Form) -> Polynomial:
+        if isinstance(other, Form):
+            return Polynomial({term: each * other for term, each in self.items()})
         if self is other and self.keys() == {()}:  # the square of a coefficient is narrower than a product
             return Polynomial({(): self[()] * self[()]})
         total = Polynomial()

@@ -105,7 +105,7 @@ def is_whole(eqn: jex.JaxprEqn, with_stacks: bool) -> bool:
     """True if an equation is one operation on all entries: an operand is a stack, or the equation is large."""
     if with_stacks:
         return True
-    # moving entries costs nothing; the next operation on them is then one operation
+    # moving the entries costs nothing here, and the next operation acts on one array
     name = eqn.primitive.name
     if not (name in ENTRYWISE or name in _BY_AXES or name in ("dot_general", "custom_jvp_call")):
         return False

@@ -249,7 +249,7 @@ def _reached_by(
     inside = np.ones(held.shape, bool)
     while surely and not np.array_equal(found, inside):
         inside = found
-        # nodes are removed and never restored, as for any largest fixed point, so at most one round per node
+        # a removed node never comes back, so there is at most one round per node
         found = inside & staying(inside)
     return Reach(found, maybe)
 

@@ -34,6 +34,6 @@ def _middle(grid: Grid) -> str:
         count - (count % 2 if cyclic else 1 - count % 2)
         for count, cyclic in zip(grid.shape, grid.periodic, strict=True)
     )
-    if shape == grid.shape or min(shape) < 2:  # a node is there already, or an axis of two points would lose one
+    if shape == grid.shape or min(shape) < 2:  # there is a node already, or an axis of two points would lose one
         return ""
     return f".\nNo node is in the middle of the box, such as 0 on [-1, 1]; shape={shape} puts one there"

@@ -201,7 +201,7 @@ def pendulum(
       discount: β.
       shape: number of nodes in angle (even) and velocity (odd), on [−π, π) × [−8, 8].
     """
-    # for m = 1 both bounds raise the pendulum without swinging: 30 > g, and as printed, with the gain g/m, 6g > g
+    # for m = 1 the torque raises the pendulum without a swing: 30 > g, and 6g > g with the gain g/m as printed
     bound = (6.0 if as_printed else 30.0) if torque is None else torque
     system = Pendulum(mass=mass, g=g, as_printed=as_printed)
     # the cost θ² is not periodic: it has a kink at hanging, where both directions cost the same

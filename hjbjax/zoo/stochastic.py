@@ -25,7 +25,7 @@ from hjbjax.zoo.ingredients import (
     unit_cost,
 )
 
-TERMS = 200  # of the series for the square; the remainder is 1e-15 inside and at most 1e-6, where terms fall like k⁻³
+TERMS = 200  # terms of the series for the square; the remainder is 1e-15 inside and at most 1e-6 at the sides
 
 
 def no_drift(x: State, u: Control) -> State:
@@ -67,7 +67,7 @@ class CubeExit:
         # the factor cosh(rate·y)/cosh(rate) decays along the smaller coordinate, but not along the larger one
         across, along = jnp.max(scaled), jnp.min(scaled)
         odd = np.arange(1, 2 * TERMS, 2)  # cos(½πk x) vanishes at ±1 for odd k
-        wave = 0.5 * np.pi * odd  # (TERMS,), like everything below
+        wave = 0.5 * np.pi * odd  # shape (TERMS,), like all arrays below
         sign = np.where(odd % 4 == 1, 1.0, -1.0)
         rate = jnp.sqrt(wave**2 + kappa**2)
         # cosine coefficients of the interval's value: 1 = Σ 2·sign/wave·cos, divided by the operator's ½(wave² + κ²)

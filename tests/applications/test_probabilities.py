@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from orders import order_of
 from scipy.stats import norm
 from systems import SEEDS, random_grid, random_problem
 
@@ -19,10 +20,6 @@ from hjbjax.problem.pytree import pytree_dataclass
 UNIT = hjb.Box([-1.0], [1.0])
 SIGMA = 0.7
 DEADLY = 2 / SIGMA**2  # of a drift of one: exp(−2μx/σ²) is the scale function
-
-
-def order_of(errors):
-    return -np.polyfit(np.arange(len(errors)) * np.log(2), np.log(errors), 1)[0]
 
 
 def interval(count, hi=1.0, lo=0.0):

@@ -1,4 +1,4 @@
-"""Problems that fall apart: the blocks that are found, values against joint grids, bounds and refusals."""
+"""Problems that separate: the blocks that are found, values against joint grids, bounds and refusals."""
 
 import jax
 import jax.numpy as jnp

@@ -11,6 +11,7 @@ from hjbjax.discretisation import stencil
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.stretching import Sinh
 
+pytestmark = pytest.mark.usefixtures("float64")
 GRIDS = [
     Grid([0.0], [1.0], (5,)),
     Grid([0.0], [1.0], (4,), (True,)),
@@ -20,12 +21,6 @@ GRIDS = [
     Grid([0.0] * 4, [1.0] * 4, (2, 3, 2, 3), (False, False, True, True)),
 ]
 ids = [f"{grid.shape}{grid.periodic}" for grid in GRIDS]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def reached(grid, index, offset):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from orders import order_of
 from scipy.sparse.linalg import spsolve
 from systems import SEEDS
 
@@ -20,10 +21,6 @@ from hjbjax.markov_chain import chain
 from hjbjax.problem.stretching import Sinh
 
 SIGMA = 0.5
-
-
-def order_of(errors):
-    return -np.polyfit(np.arange(len(errors)) * np.log(2), np.log(errors), 1)[0]
 
 
 def hitting_time(x, drift):

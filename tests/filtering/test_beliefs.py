@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_rates import rates
 
 import hjbjax as hjb
 from hjbjax.filtering import belief_problem
@@ -30,12 +31,6 @@ class Chain:
 
     def cost(self, u):
         return jnp.asarray(self.costs)[0] + u[0] * jnp.asarray(self.costs)[1]
-
-
-def rates(rng, states, scale=1.0):
-    found = scale * rng.uniform(0, 1, (states, states)) * (rng.uniform(size=(states, states)) < 0.8)
-    np.fill_diagonal(found, 0)
-    return found - np.diag(found.sum(axis=1))
 
 
 def random_chain(rng, states):

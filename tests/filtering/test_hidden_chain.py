@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_rates import rates
 from scipy.linalg import expm
 
 import hjbjax as hjb
@@ -16,12 +17,6 @@ from hjbjax.filtering import Observer, WonhamFilter, belief_problem, simulate_hi
 from hjbjax.filtering.hidden_chain import transition_matrix
 
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def rates(rng, states, scale=1.0):
-    found = scale * rng.uniform(0, 1, (states, states)) * (rng.uniform(size=(states, states)) < 0.8)
-    np.fill_diagonal(found, 0)
-    return found - np.diag(found.sum(axis=1))
 
 
 # --- the filter ---

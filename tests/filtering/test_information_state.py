@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from orders import order_of
 from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -23,10 +24,6 @@ from hjbjax.problem.sets import Box
 from hjbjax.problem.stretching import Sinh
 
 R = 0.5
-
-
-def order_of(errors):
-    return -np.polyfit(np.arange(len(errors)) * np.log(2), np.log(errors), 1)[0]
 
 
 def identity(x):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from orders import order_of
 from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag, expm
@@ -44,10 +45,6 @@ START, PRIOR = np.array([1.0, -0.5]), np.array([[0.5, 0.1], [0.1, 0.3]])
 
 def kalman(problem=PROBLEM, plant=PLANT, r=R):
     return ExtendedKalman(problem, plant.h, START, PRIOR, measurement_noise=r)
-
-
-def order_of(errors):
-    return -np.polyfit(np.arange(len(errors)) * np.log(2), np.log(errors), 1)[0]
 
 
 @jax.jit

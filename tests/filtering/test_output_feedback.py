@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from orders import order_of
 from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
@@ -32,10 +33,6 @@ def position(x):
 
 def quadratic(x, u):
     return x @ x + u @ u
-
-
-def order_of(errors):
-    return -np.polyfit(np.arange(len(errors)) * np.log(2), np.log(errors), 1)[0]
 
 
 @pytree_dataclass()

@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from orders import order_of
 from scipy.integrate import solve_ivp
 
 import hjbjax as hjb
 from hjbjax.filtering import Observer, RobustGridFilter, robust_filter
 
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def order_of(errors):
-    return -np.polyfit(np.arange(len(errors)) * np.log(2), np.log(errors), 1)[0]
 
 
 # --- linear systems: K and x̂ of p = −½ (x − x̂)ᵀ K (x − x̂) + φ from their own equations ---

@@ -12,11 +12,7 @@ from hjbjax import geometry, zoo
 from hjbjax.geometry import stability
 from hjbjax.geometry.distributions import _reach, _span_of_generations
 
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def motor(inductance):

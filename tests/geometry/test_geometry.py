@@ -26,11 +26,7 @@ import hjbjax as hjb
 from hjbjax import geometry, zoo
 from hjbjax.problem.pytree import pytree_dataclass
 
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @pytree_dataclass()

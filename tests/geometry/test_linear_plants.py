@@ -7,7 +7,6 @@ whose greatest common divisor has the degree of what is out of reach, and the de
 
 from fractions import Fraction
 
-import jax
 import numpy as np
 import pytest
 import sympy
@@ -16,14 +15,9 @@ from linear_plants import Linear
 from hjbjax import geometry
 from hjbjax.geometry import stability
 
+pytestmark = pytest.mark.usefixtures("float64")
 S = sympy.Symbol("s")
 N = 3
-
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def dense(random):

@@ -15,11 +15,7 @@ from hjbjax import geometry, zoo
 from hjbjax.geometry import stability
 from hjbjax.problem.pytree import pytree_dataclass
 
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 # The pendulum, section 2

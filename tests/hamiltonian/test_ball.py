@@ -16,11 +16,7 @@ from hjbjax.discretisation.players import combinations
 from hjbjax.hamiltonian.ball import kinked_ball, least_in_ball
 from hjbjax.hamiltonian.piecewise import Kinked
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @functools.partial(jax.jit, static_argnames=("sign", "curved"))

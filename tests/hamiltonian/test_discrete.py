@@ -19,16 +19,11 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite, samples
 
+pytestmark = pytest.mark.usefixtures("float64")
 CASES = [(1, "diagonal"), (2, "none"), (2, "matrix"), (2, "function"), (3, "matrix")]
 CASES += [pytest.param(n, kind, marks=pytest.mark.slow) for n, kind in ((3, "diagonal"), (4, "matrix"))]
 SCHEMES = [Upwind(central=False), Upwind(central=True)]
 UNIT = Box([-1.0], [1.0])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 @functools.partial(jax.jit, static_argnames="scheme")

@@ -12,11 +12,7 @@ from systems import SEEDS
 
 from hjbjax.hamiltonian.piecewise import Kinked, piecewise_input, piecewise_pair
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def pieces_of(offset, slope, at, derivatives):

@@ -16,14 +16,9 @@ from hjbjax.hamiltonian import discrete
 from hjbjax.hamiltonian.optimum import optimise
 from hjbjax.hamiltonian.search import UNROLL, enumerate_actions, optimum, refine
 
+pytestmark = pytest.mark.usefixtures("float64")
 NODES = 6
 laws = settings(max_examples=30)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def wavy(parameters, action):

@@ -9,23 +9,14 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 from scipy.optimize import minimize
+from torus import SHAPE, SPACING, found
 
 import hjbjax as hjb
-from hjbjax.discretisation.discretisation import Discretisation
-from hjbjax.hamiltonian import discrete, exact, optimum, pointwise
+from hjbjax.hamiltonian import pointwise
 from hjbjax.hamiltonian.simplex import least_in_simplex, project
 from hjbjax.problem import sets
-from hjbjax.problem.pytree import cast
 
-SHAPE = (4, 3)
-GRID = hjb.Grid([0.0, 0.0], [1.0, 1.0], SHAPE, periodic=(True, True))
-SPACING = np.array([1 / 4, 1 / 3])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 SLOWLY = [
@@ -131,15 +122,6 @@ def drawn(seed, n):
 
 def problem_of(numbers, admissible, sigma=None):
     return hjb.Problem(Partial(drift, numbers), Partial(cost, numbers), admissible, noise=sigma, discount=1.0)
-
-
-@functools.partial(jax.jit, static_argnames="dtype")
-def found(problem, value, dtype=np.float64):
-    on = cast(Discretisation(problem, GRID, hjb.Upwind(), dtype), dtype)
-    hamiltonian = discrete.around(on, jnp.asarray(value, dtype))
-    best, u, _ = optimum.optimise(hamiltonian)
-    missed = exact.optimum_error(hamiltonian, hamiltonian.on.players.control, lambda u: (u, []))
-    return best, jnp.stack([jnp.broadcast_to(each, SHAPE) for each in u], -1), missed
 
 
 def hamiltonians(numbers, value, sigma, u):

@@ -22,18 +22,13 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 
+pytestmark = pytest.mark.usefixtures("float64")
 UNIT = Box([-1.0], [1.0])
 NOISES = ["none", "diagonal", "matrix"]
 FEW = [pytest.param("none", marks=pytest.mark.slow), pytest.param("diagonal", marks=pytest.mark.slow), "matrix", "game"]
 laws = settings(max_examples=12)
 # the old emitters take minutes: every candidate of a minimum reads several neighbours, and more with noise
 jitted = functools.partial(jax.jit, compiler_options=xla.with_emitters())
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def upwind(problem, grid):

@@ -23,14 +23,9 @@ from hjbjax.problem.pytree import cast
 from hjbjax.problem.sets import Finite
 from hjbjax.solution.solution import Solution
 
+pytestmark = pytest.mark.usefixtures("float64")
 POINTS = np.array([[-1.0], [0.0], [0.4], [1.0]])
 laws = settings(max_examples=10)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 @functools.partial(jax.jit, static_argnames="kind")
@@ -46,7 +41,7 @@ def measured(kind, problem, grid, value, obstacles, least_cost, counted, moved):
 def bounds_of(kind, problem, grid, value, obstacles, least_cost=None, counted=None):
     counted = np.ones(grid.shape, bool) if counted is None else counted
     gap, _ = jax.device_get(measured(kind, problem, grid, value, obstacles, least_cost, counted, np.inf))
-    return gap, Solution(grid, value, None, enclosure=certificates.enclosure(kind, gap, problem.discount)).bounds
+    return gap, Solution(grid, value, None, enclosure=certificates.affine_bounds(kind, gap, problem.discount)).bounds
 
 
 def exact_solution(problem, grid, obstacles, start=0.0):
@@ -208,7 +203,7 @@ def test_before_the_first_look_nothing_is_known():
     unlooked = certificates.ErrorBound(-np.inf, np.inf, 0.0, np.inf, np.inf)
     for kind in (Certificate.ADDITIVE, Certificate.MULTIPLICATIVE):
         value = np.array([0.0, 2.0, np.inf])
-        solution = Solution(Grid([0.0], [1.0], (3,)), value, None, enclosure=certificates.enclosure(kind, unlooked))
+        solution = Solution(Grid([0.0], [1.0], (3,)), value, None, enclosure=certificates.affine_bounds(kind, unlooked))
         np.testing.assert_array_equal(solution.bounds, [[-np.inf, -np.inf, np.inf], [np.inf] * 3])
         assert solution.error == np.inf
 
@@ -244,7 +239,7 @@ def test_no_bound_where_the_theorem_says_nothing():
     assert np.isfinite(steep.below)
     free, _ = bounds_of(Certificate.MULTIPLICATIVE, problem, grid, 0.9 * exact, obstacles, np.array([1.0, 1, 0, 1, 1]))
     assert np.isinf(free.error)
-    assert certificates.enclosure(Certificate.NONE, free) is None
+    assert certificates.affine_bounds(Certificate.NONE, free) is None
 
 
 def test_where_the_value_is_flat_rounding_certifies_nothing():
@@ -269,7 +264,7 @@ def test_lifted_bounds_are_rounded_outwards(seed):
     below, above = float(rng.choice([1.0, rng.uniform(0, 1)])), float(10.0 ** rng.choice([0.0, rng.uniform(0, 7.8)]))
     value = np.append(-lift, -lift * (1 - 10.0 ** rng.uniform(-16, 0, 20)))
     gap = certificates.ErrorBound(*(np.asarray(number) for number in (below, above, lift, 0.0, 0.0)))
-    enclosure = certificates.enclosure(Certificate.MULTIPLICATIVE, gap)
+    enclosure = certificates.affine_bounds(Certificate.MULTIPLICATIVE, gap)
     lower, upper = Solution(Grid([0.0], [1.0], (21,)), value, None, enclosure=enclosure).bounds
     for v, low, high in zip(value, lower, upper, strict=True):
         raised = Fraction(v) + Fraction(lift)

@@ -16,11 +16,7 @@ from hjbjax.discretisation.rates import Rates
 from hjbjax.iteration.bellman import PolicyEquation
 from hjbjax.iteration.evaluation import Direct, Evaluation, Krylov, Sweeps, evaluate, jacobi, left_over, relaxed
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @functools.partial(jax.jit, static_argnames="rounds")

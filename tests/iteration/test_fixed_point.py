@@ -16,16 +16,11 @@ from hjbjax.problem.grid import tabulated
 from hjbjax.solution.status import Status
 from hjbjax.solvers.setup import prepare_on_host
 
+pytestmark = pytest.mark.usefixtures("float64")
 GRID = hjb.Grid([-1.0], [1.0], (11,))
 LARGE = 1e6  # the size of the value, whose rounding is 64 eps of it
 RECORD = progress.no_progress(np.float64)
 ROUNDING = progress.ROUNDING * np.finfo(np.float64).eps * LARGE
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def expected(residual, error, best, nearest, since, tol):

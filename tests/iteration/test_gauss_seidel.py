@@ -15,11 +15,7 @@ from systems import SEEDS
 
 from hjbjax.iteration import gauss_seidel
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def passes(count, rounds, slab=None):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from orders import order_of
 
 import hjbjax as hjb
 from hjbjax import zoo
@@ -29,11 +30,6 @@ def largest_error(question, exact, where=None, **options):
     return np.max(off if where is None else off[where(grid.nodes())])
 
 
-def fitted_order(errors):
-    """The slope of log error over log h for spacings that halve."""
-    return -np.polyfit(np.arange(len(errors)), np.log2(errors), 1)[0]
-
-
 # --- errors of the first-order chain, evaluated independently ---
 
 
@@ -51,7 +47,7 @@ def test_bang_bang_errors_and_order(noise, scheme, known, order):
     exact = zoo.bang_bang_exact(noise=noise)
     errors = [largest_error(zoo.bang_bang(noise=noise, shape=(n,)), exact, scheme=scheme) for n in (41, 81, 161)]
     np.testing.assert_allclose(errors, known, rtol=0.05)
-    assert abs(fitted_order(errors) - order) <= 0.15
+    assert abs(order_of(errors) - order) <= 0.15
 
 
 RADIUS = 0.2
@@ -88,7 +84,7 @@ def eikonal_error(n):
 def test_eikonal_errors_and_order(count):
     errors = [eikonal_error(n) for n in (41, 81, 161)[:count]]
     np.testing.assert_allclose(errors, (9.2e-3, 4.5e-3, 2.3e-3)[:count], rtol=0.05)
-    assert abs(fitted_order(errors) - 1) <= 0.15
+    assert abs(order_of(errors) - 1) <= 0.15
 
 
 @pytest.mark.slow
@@ -99,7 +95,7 @@ def test_smooth_nonlinear_problem_errors_and_order():
     exact = zoo.smooth_exact()
     errors = [largest_error(zoo.smooth(shape=(n, n)), exact, inner, tol=1e-6) for n in (41, 81, 161)]
     np.testing.assert_allclose(errors, (3.15e-2, 1.58e-2, 7.9e-3), rtol=0.05)
-    assert abs(fitted_order(errors) - 1) <= 0.15
+    assert abs(order_of(errors) - 1) <= 0.15
 
 
 @pytest.mark.slow
@@ -159,7 +155,7 @@ def test_brownian_exit_from_a_ball_is_exact_in_any_dimension(dim):
 def test_discounted_brownian_exit_is_second_order():
     exact = zoo.brownian_exit_exact(discount=2.0)
     errors = [largest_error(zoo.brownian_exit(discount=2.0, shape=(n,)), exact, tol=1e-10) for n in (21, 41, 81)]
-    assert abs(fitted_order(errors) - 2) <= 0.15
+    assert abs(order_of(errors) - 2) <= 0.15
     assert errors[-1] <= 1e-4
 
 
@@ -232,7 +228,7 @@ def test_lq_on_the_inner_half_is_first_order():
     exact = zoo.double_integrator_lq_exact()
     errors = [largest_error(zoo.double_integrator_lq(shape=(n, n)), exact, inner, tol=1e-4) for n in (21, 41, 81)]
     assert errors[-1] <= 0.5
-    assert abs(fitted_order(errors) - 1) <= 0.15
+    assert abs(order_of(errors) - 1) <= 0.15
 
 
 # --- constraints ---
@@ -291,4 +287,4 @@ def test_perpetual_put_on_a_log_price_grid():
         assert abs(np.log(exercised.max() / 52.63158)) <= 2 * grid.spacing(0)
         assert np.all(-solution.value >= payoff - 1e-12)
     assert errors[-1] <= 0.02
-    assert fitted_order(errors) >= 0.85  # the free boundary lies between nodes: between first and second order
+    assert order_of(errors) >= 0.85  # the free boundary lies between nodes: between first and second order

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from orders import order_of
 
 import hjbjax as hjb
 from hjbjax import zoo
@@ -90,10 +91,6 @@ def largest_error(question, exact, where=None, scheme=hjb.Limited(), tol=1e-9): 
     return np.max(off if where is None else off[where(grid.nodes())])
 
 
-def fitted_order(errors):
-    return -np.polyfit(np.arange(len(errors)), np.log2(errors), 1)[0]
-
-
 def inside(half_width):
     return lambda x: np.max(np.abs(x), axis=-1) <= half_width + 1e-9
 
@@ -109,14 +106,14 @@ def test_smooth_nonlinear_problem_is_second_order():
     errors = [largest_error(zoo.smooth(shape=(n, n)), zoo.smooth_exact(), inner) for n in (41, 81, 161)]
     np.testing.assert_allclose(errors, (1.8e-5, 5.1e-6, 1.4e-6), rtol=0.05)  # evaluated independently
     assert errors[1] <= 1e-5
-    assert fitted_order(errors) >= 1.8
+    assert order_of(errors) >= 1.8
 
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
 @pytest.mark.slow
 def test_manufactured_problem_on_a_line_is_second_order():
     errors = [largest_error(on_a_line(n), Line().value, inside(0.5)) for n in (41, 81, 161)]
-    assert fitted_order(errors) >= 1.8
+    assert order_of(errors) >= 1.8
     assert errors[1] <= 0.02 * largest_error(on_a_line(81), Line().value, inside(0.5), PLAIN)
 
 
@@ -143,7 +140,7 @@ def test_value_with_a_kink_in_its_policy_is_second_order():
     """Bang-bang without noise."""
     errors = [largest_error(zoo.bang_bang(shape=(n,)), zoo.bang_bang_exact()) for n in (41, 81, 161)]
     assert errors[1] <= 5e-4
-    assert fitted_order(errors) >= 1.8
+    assert order_of(errors) >= 1.8
     assert largest_error(zoo.bang_bang(), zoo.bang_bang_exact(), scheme=PLAIN) == pytest.approx(2.879e-2, rel=0.05)
 
 
@@ -156,7 +153,7 @@ def test_bang_bang_with_noise():
     question, exact = zoo.bang_bang(noise=NOISE, shape=(41,)), zoo.bang_bang_exact(noise=NOISE)
     assert largest_error(question, exact, scheme=hjb.Upwind()) <= 7e-4
     errors = [largest_error(zoo.bang_bang(noise=NOISE, shape=(n,)), exact) for n in (41, 81, 161)]
-    assert fitted_order(errors) >= 1.8
+    assert order_of(errors) >= 1.8
     assert errors[0] <= 0.1 * largest_error(question, exact, scheme=PLAIN)
 
 
@@ -240,7 +237,7 @@ def test_a_box_beats_its_samples(scheme):
         gain = hjb.solve(sampled, grid, scheme=scheme, tol=tol).value - value
         assert np.all(gain >= -2 * tol)
         gains.append(np.mean(gain))
-    assert abs(fitted_order(gains) - 2) <= 0.3
+    assert abs(order_of(gains) - 2) <= 0.3
     assert gains[-1] <= 1e-3
 
 

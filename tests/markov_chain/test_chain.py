@@ -19,6 +19,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.sets import Ball, Box, Finite
 
+pytestmark = pytest.mark.usefixtures("float64")
 PLAIN = Upwind(central=False)
 KINDS = ("none", "scalar", "diagonal", "matrix")
 FEW = [(1, "scalar"), (2, "none"), (2, "matrix"), (2, "function"), (3, "matrix")]
@@ -26,12 +27,6 @@ REST = {(n, kind) for n in (1, 2, 3, 4) for kind in KINDS} - {(1, "none"), *FEW}
 CASES = [(1, "none"), *FEW, *(pytest.param(*case, marks=pytest.mark.slow) for case in sorted(REST))]
 UNIT = Box([-1.0], [1.0])
 laws = settings(max_examples=15)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def drift_and_noise(problem, grid, policy):

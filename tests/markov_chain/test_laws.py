@@ -14,14 +14,9 @@ from systems import SEEDS, random_grid, random_problem
 import hjbjax as hjb
 from hjbjax.markov_chain import chain
 
+pytestmark = pytest.mark.usefixtures("float64")
 KINDS = [(1, "scalar"), (2, "matrix")]
 UNIT = hjb.Box([-1.0], [1.0])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def random_law(rng, shape):

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from orders import order_of
 from systems import SEEDS, random_grid, random_problem
 
 from hjbjax.discretisation.schemes import Upwind
@@ -14,10 +15,6 @@ from hjbjax.problem.sets import Box
 from hjbjax.problem.stretching import Sinh
 
 COUNTS = (65, 129, 257)
-
-
-def order_of(errors):
-    return -np.polyfit(np.arange(len(errors)) * np.log(2), np.log(errors), 1)[0]
 
 
 def ornstein_uhlenbeck(x, u):

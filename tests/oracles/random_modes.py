@@ -10,6 +10,18 @@ import hjbjax as hjb
 
 NAMES = ("low", "middle", "high", "highest")
 CHAIN = hjb.Upwind(central=False)
+METHODS = (
+    hjb.ValueIteration(), hjb.PolicyIteration(hjb.Direct()), hjb.PolicyIteration(hjb.Krylov()),
+    hjb.PolicyIteration(hjb.Sweeps()), hjb.Nested(coarsest=10),
+)  # fmt: skip
+
+
+def assert_certified(found, exact, seed):
+    """The exact value is within the certified bounds, up to rounding."""
+    lower, upper = found.bounds
+    slack = 1e-11 * (1 + np.max(np.abs(exact)))
+    assert np.all(lower - slack <= exact), seed
+    assert np.all(exact <= upper + slack), seed
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import random_jumps
-from random_modes import CHAIN
+from random_modes import CHAIN, METHODS, assert_certified
 from scipy.linalg import expm
 from scipy.special import factorial
 
@@ -14,13 +14,6 @@ from hjbjax.feedback.simulation import rollout
 
 pytestmark = pytest.mark.filterwarnings("ignore::hjbjax.SolveWarning")
 KINDS = {"noise": {}, "no noise": {"noise": False}, "landings that the control steers": {"steered": True}}
-
-
-def assert_certified(found, exact, seed):
-    lower, upper = found.bounds
-    slack = 1e-11 * (1 + np.max(np.abs(exact)))
-    assert np.all(lower - slack <= exact), seed
-    assert np.all(exact <= upper + slack), seed
 
 
 @pytest.mark.parametrize(
@@ -53,17 +46,7 @@ def test_two_hundred_certificates_hold(kind, shape, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "method",
-    [
-        hjb.ValueIteration(),
-        hjb.PolicyIteration(hjb.Direct()),
-        hjb.PolicyIteration(hjb.Krylov()),
-        hjb.PolicyIteration(hjb.Sweeps()),
-        hjb.Nested(coarsest=10),
-    ],
-    ids=repr,
-)
+@pytest.mark.parametrize("method", METHODS, ids=repr)
 def test_every_method_finds_the_same_value(method):
     for seed, kind in enumerate(KINDS.values()):
         one = random_jumps.draw(seed, (5, 6))

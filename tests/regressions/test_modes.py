@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import random_modes
-from random_modes import CHAIN, NAMES
+from random_modes import CHAIN, METHODS, NAMES, assert_certified
 from scipy.linalg import expm
 
 import hjbjax as hjb
@@ -23,13 +23,6 @@ KINDS = {
     "both, without noise": {"noise": False},
     "rates that the control steers": {"steered": True},
 }
-
-
-def assert_certified(found, exact, seed):
-    lower, upper = found.bounds
-    slack = 1e-11 * (1 + np.max(np.abs(exact)))
-    assert np.all(lower - slack <= exact), seed
-    assert np.all(exact <= upper + slack), seed
 
 
 QUICK = ("both",)
@@ -66,17 +59,7 @@ def test_five_hundred_certificates_hold(kind, shape, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "method",
-    [
-        hjb.ValueIteration(),
-        hjb.PolicyIteration(hjb.Direct()),
-        hjb.PolicyIteration(hjb.Krylov()),
-        hjb.PolicyIteration(hjb.Sweeps()),
-        hjb.Nested(coarsest=10),
-    ],
-    ids=repr,
-)
+@pytest.mark.parametrize("method", METHODS, ids=repr)
 def test_every_method_finds_the_same_value(method):
     for seed, kind in enumerate(KINDS.values()):
         one = random_modes.draw(seed, (5, 6), 3)

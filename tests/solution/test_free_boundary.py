@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from binomial_tree import binomial_put
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -143,20 +144,6 @@ def test_a_file_keeps_the_sets(tmp_path):
     np.testing.assert_array_equal(again.stopping, solution.stopping)
     np.testing.assert_array_equal(again.free_boundary(), solution.free_boundary())
     assert "it is optimal to stop" in str(solution.to_xarray().stopping.attrs)
-
-
-def binomial_put(strike, rate, volatility, horizon, spot, steps=2000):
-    """An American put by a tree of Cox, Ross and Rubinstein; the price of the tree with backward induction."""
-    dt = horizon / steps
-    up = np.exp(volatility * np.sqrt(dt))
-    chance = (np.exp(rate * dt) - 1 / up) / (up - 1 / up)
-    prices = spot * up ** np.arange(-steps, steps + 1, 2.0)
-    values = np.maximum(strike - prices, 0)
-    for _ in range(steps):
-        prices = prices[:-1] * up
-        values = np.exp(-rate * dt) * (chance * values[1:] + (1 - chance) * values[:-1])
-        values = np.maximum(values, strike - prices)
-    return float(values[0])
 
 
 @pytest.mark.parametrize("method", [hjb.Implicit(), pytest.param(None, marks=pytest.mark.slow)], ids=str)

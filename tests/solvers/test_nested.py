@@ -14,16 +14,10 @@ from hjbjax.solution.clock import Clock
 from hjbjax.solvers import coarse_levels, nested_grids
 from hjbjax.solvers.setup import prepare_on_host
 
+pytestmark = pytest.mark.usefixtures("float64")
 METHOD = hjb.PolicyIteration(hjb.Sweeps())
 SCHEME = hjb.Upwind(subcell=True)
 KIND = np.dtype(float)
-
-
-@pytest.fixture(autouse=True)
-def _doubles():
-    """In float64, as a solve is."""
-    with jax.enable_x64(True):
-        yield
 
 
 def task_of(problem, grid):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from component_functions import by_components, by_vmap, steep
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,16 +16,6 @@ from hjbjax.tracing import components, interpreter
 RISE = np.arange(16.0).reshape(4, 4) / 7
 TABLE = np.linspace(-1.5, 1.5, 9)
 GRID = Grid([-1.0, -1.1, -0.9, -1.3], [1.0, 1.2, 1.3, 1.4], (3, 4, 2, 5))
-
-
-@jax.custom_jvp
-def steep(x):
-    return jnp.sin(x)
-
-
-@steep.defjvp
-def _(primals, tangents):  # twice the true slope, so that a test sees whose derivative is used
-    return steep(primals[0]), 2 * jnp.cos(primals[0]) * tangents[0]
 
 
 @jax.custom_vjp
@@ -110,18 +101,6 @@ DIFFERENTIATED = (  # every kind of rule, and every kind of fallback
     *("cumulative", "reductions", "elementary", "jax.nn", "logsumexp", "cond", "custom_jvp of a scalar"),
     *("custom_jvp of a vector", "checkpoint inside", "grad inside", "hessian inside", "argmax", "solve", "custom_vjp"),
 )
-
-
-def by_vmap(function, grid, dtype):
-    table = jnp.asarray(grid.nodes(), dtype).reshape(-1, grid.ndim)
-    result = jax.vmap(function)(table)
-    return result.reshape(*grid.shape, *result.shape[1:])
-
-
-def by_components(function, grid, dtype):
-    entries = components.components(function, grid.components(dtype), dtype=dtype)
-    full = [jnp.broadcast_to(jnp.asarray(entry), grid.shape) for entry in entries.flat]
-    return jnp.stack(full, axis=-1).reshape(*grid.shape, *entries.shape)
 
 
 def both(function, grid, dtype):

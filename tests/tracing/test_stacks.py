@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from component_functions import by_components, by_vmap, steep
 
 from hjbjax import Grid
 from hjbjax.tracing import components, stacks
@@ -13,16 +14,6 @@ GRID = Grid([-1.0, -1.1, -0.9], [1.0, 1.2, 1.3], (3, 4, 2))
 RNG = np.random.default_rng(1)
 WIDE, SQUARE = RNG.normal(size=(32, 3)) / 2, RNG.normal(size=(32, 32)) / 6
 CUBE = RNG.normal(size=(5, 4, 3))
-
-
-@jax.custom_jvp
-def steep(x):
-    return jnp.sin(x)
-
-
-@steep.defjvp
-def _(primals, tangents):  # twice the true slope, so that a test sees whose derivative is used
-    return steep(primals[0]), 2 * jnp.cos(primals[0]) * tangents[0]
 
 
 def hidden(x, p):
@@ -56,18 +47,6 @@ LONG = {
 }
 
 
-def by_vmap(function, dtype):
-    table = jnp.asarray(GRID.nodes(), dtype).reshape(-1, GRID.ndim)
-    result = jax.vmap(function)(table)
-    return result.reshape(*GRID.shape, *result.shape[1:])
-
-
-def by_components(function, dtype):
-    entries = components.components(function, GRID.components(dtype), dtype=dtype)
-    full = [jnp.broadcast_to(jnp.asarray(entry), GRID.shape) for entry in entries.flat]
-    return jnp.stack(full, axis=-1).reshape(*GRID.shape, *entries.shape)
-
-
 @pytest.mark.parametrize("name", LONG)
 def test_long_vectors_are_what_vmap_gives_with_their_derivatives(name):
     weights = RNG.normal(size=97)
@@ -79,7 +58,7 @@ def test_long_vectors_are_what_vmap_gives_with_their_derivatives(name):
 
     @jax.jit
     def results(p):
-        return tuple(way(lambda x: LONG[name](x, p), "float64") for way in (by_components, by_vmap))
+        return tuple(way(lambda x: LONG[name](x, p), GRID, "float64") for way in (by_components, by_vmap))
 
     with jax.enable_x64(True):
         got, expected = results(0.7)
@@ -92,7 +71,7 @@ def test_long_vectors_are_what_vmap_gives_with_their_derivatives(name):
 
 def test_float32_stays_float32_and_vmap_over_a_parameter_is_one_program():
     def values(p, way):
-        return way(lambda x: LONG["network"](x, p), "float32")
+        return way(lambda x: LONG["network"](x, p), GRID, "float32")
 
     p = np.array([0.7, -0.2], np.float32)
     got = jax.jit(jax.vmap(lambda p: values(p, by_components)))(p)
@@ -102,7 +81,7 @@ def test_float32_stays_float32_and_vmap_over_a_parameter_is_one_program():
 
 def test_reverse_mode_reaches_every_weight():
     def loss(matrix, way):
-        return jnp.sum(way(lambda x: jnp.tanh(matrix @ hidden(x, 0.7))[:2] * x[0], "float64") ** 2)
+        return jnp.sum(way(lambda x: jnp.tanh(matrix @ hidden(x, 0.7))[:2] * x[0], GRID, "float64") ** 2)
 
     with jax.enable_x64(True):
         got, expected = (jax.jit(jax.grad(loss), static_argnums=1)(SQUARE, way) for way in (by_components, by_vmap))

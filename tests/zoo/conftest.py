@@ -1,15 +1,13 @@
 """The zoo is checked in float64, at random states."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 
 @pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+def _float64(float64):
+    pass
 
 
 @pytest.fixture

@@ -1,9 +1,12 @@
 """The problems of economics and finance, solved: values, policies and free boundaries against their closed forms."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from binomial_tree import binomial_put
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -101,30 +104,17 @@ def test_comparative_statics_of_a_perpetual_put(name):
     assert float(jax.grad(price)(number)) == pytest.approx(float(wanted), rel=8e-3)
 
 
-def binomial_put(put, maturity, spot, steps=1000):
-    """An American put by the tree of Cox, Ross and Rubinstein."""
-    dt = maturity / steps
-    up = np.exp(put.volatility * np.sqrt(dt))
-    chance = (np.exp(put.interest * dt) - 1 / up) / (up - 1 / up)
-    prices = spot * up ** np.arange(-steps, steps + 1, 2.0)
-    values = np.maximum(put.strike - prices, 0)
-    for _ in range(steps):
-        prices = prices[:-1] * up
-        values = np.exp(-put.interest * dt) * (chance * values[1:] + (1 - chance) * values[:-1])
-        values = np.maximum(values, put.strike - prices)
-    return float(values[0])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("numbers", [{}, {"strike": 1.0, "interest": 0.04, "volatility": 0.3}])
 def test_an_american_put_agrees_with_a_binomial_tree(numbers):
     put = zoo.AmericanPut(**({"strike": 40.0, "interest": 0.06, "volatility": 0.2} | numbers))
     problem, grid = zoo.american_put(**numbers)
     solution = hjb.solve(problem, grid, tol=1e-4 * put.strike)
+    tree = functools.partial(binomial_put, put.strike, put.interest, put.volatility, steps=1000)
     for time in (0.5, 1.0):
         for moneyness in (0.9, 1.0, 1.15):
             spot = moneyness * put.strike
-            wanted = binomial_put(put, time, spot)
+            wanted = tree(time, spot)
             assert float(solution.value_at([spot, time])) == pytest.approx(wanted, abs=1e-4 * put.strike)
     if not numbers:
         assert float(solution.value_at([40.0, 1.0])) == pytest.approx(2.31958, abs=2e-3)
@@ -134,7 +124,7 @@ def test_an_american_put_agrees_with_a_binomial_tree(numbers):
     last = segments[np.argmax(segments[:, 1])]
     assert last[1] == pytest.approx(1.0)
     cell = grid.axis(0)[1]
-    early, late = (binomial_put(put, 1.0, last[0] + s * cell) - (put.strike - last[0] - s * cell) for s in (-1, 1))
+    early, late = (tree(1.0, last[0] + s * cell) - (put.strike - last[0] - s * cell) for s in (-1, 1))
     assert early < 1e-4 * put.strike < 2e-4 * put.strike < late
 
 

@@ -341,7 +341,10 @@ def test_a_refusal_of_the_solver_is_one_line(solver, error, code):
     assert not os.listdir(".")
 
 
-@pytest.mark.parametrize(("text", "code"), [("RESOURCE_EXHAUSTED: 9 TB", 6), ("INTERNAL: broken", 4)])
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [("RESOURCE_EXHAUSTED: 9 TB", 6), ("INTERNAL: Out of memory allocating 9 bytes.", 6), ("INTERNAL: broken", 4)],
+)
 def test_a_fault_of_the_device_has_a_code(solver, text, code):
     import jax
 

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -16,6 +17,10 @@ os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # or commands find in a us
 
 # Traced programs are millions of objects that stay: looking through them again and again finds nothing.
 gc.set_threshold(1_000_000, 50, 1000)
+
+# A shell starts jobs in the background with Ctrl-C ignored, also for the processes that they start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The first example of a law compiles what the others reuse, so a deadline would time the compiler.
 settings.register_profile("hjbjax", deadline=None, print_blob=True)

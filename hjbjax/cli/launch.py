@@ -73,10 +73,12 @@ def member() -> Member | None:
         known = ", ".join(name for name in VARIABLES if name in os.environ)
         raise Failure(f"{missing[0]} is not set, but {known} is; {_ADVICE}")
     processes = _count(PROCESSES, 1, MOST)
-    host, _, port = os.environ[COORDINATOR].rpartition(":")
-    if not host or not 0 < (finite(port, int) or 0) < 2**16:
+    host, _, text = os.environ[COORDINATOR].rpartition(":")
+    port = finite(text, int) or 0
+    if not host or not 0 < port < 2**16:
         raise Failure(f"{COORDINATOR}: got {os.environ[COORDINATOR]!r}, wanted HOST:PORT; {_ADVICE}")
-    return Member(_count(RANK, 0, processes - 1), processes, os.environ[COORDINATOR], _count(HEARTBEAT, 1, LONGEST))
+    # the number, because other programs do not read every text that Python reads, such as 4_000
+    return Member(_count(RANK, 0, processes - 1), processes, f"{host}:{port}", _count(HEARTBEAT, 1, LONGEST))
 
 
 def _count(name: str, least: int, most: int) -> int:

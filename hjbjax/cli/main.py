@@ -339,6 +339,7 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
     import jax
 
     import hjbjax as hjb
+    from hjbjax.solvers.memory import is_exhausted
 
     given = _given(options)
     try:
@@ -351,7 +352,7 @@ def _solve(problem: "Problem", grid: "Grid", options: dict[str, Any]) -> "Soluti
     except MemoryError as error:
         raise Failure(error, 6) from error
     except jax.errors.JaxRuntimeError as error:  # XLA has one type for all errors, and a code in the text
-        raise Failure(error, 6 if "RESOURCE_EXHAUSTED" in str(error) else 4) from error
+        raise Failure(error, 6 if is_exhausted(error) else 4) from error
 
 
 def _write(

@@ -224,13 +224,22 @@ def neighbour(values: AtNodes, grid: Grid, offset: tuple[int, ...], *, ghost: bo
             parts = [outside, jax.lax.slice_in_dim(values, 0, grid.shape[axis] - 1, axis=axis)]
         else:
             parts = [jax.lax.slice_in_dim(values, 1, grid.shape[axis], axis=axis), outside]
-        moved = jnp.concatenate(parts, axis=axis)  # XLA fuses this, but stores an array for a pad
+        moved = _concatenated(parts, axis)
         if step > 0 and not grid.layout.even(axis):
             # the last entry may be padding of this part, and the one before it the last node
             place = jnp.arange(grid.shape[axis]).reshape([-1 if i == axis else 1 for i in range(grid.ndim)])
             moved = jnp.where(place == grid.layout.count(axis) - 1, outside, moved)
         values = moved
     return values
+
+
+def _concatenated(parts: Sequence[jax.Array], axis: int) -> jax.Array:
+    """The parts joined along an axis, in a form that XLA fuses into the loop over the nodes.
+
+    XLA stores an array for a pad, and from version 0.12 on for a concatenation along the last axis, but not along the
+    axis before an axis of one entry.
+    """
+    return jnp.concatenate([part[..., None] for part in parts], axis=axis)[..., 0]
 
 
 def unit(grid: Grid, axis: int, step: int) -> tuple[int, ...]:

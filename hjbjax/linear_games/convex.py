@@ -41,6 +41,7 @@ class Largest:
     offsets: Any
     norms: tuple[tuple[Any, Any, Any], ...] = ()
 
+    @own_settings()
     def __call__(self, x: State) -> jax.Array:
         """J(x) at one state."""
         affine = jnp.asarray(self.rows) @ x - jnp.asarray(self.offsets)
@@ -109,6 +110,7 @@ class Quadratic(_WithoutBarrier):
     slope: Any
     offset: Any
 
+    @own_settings()
     def __call__(self, x: State) -> jax.Array:
         """J(x) at one state."""
         return x @ (jnp.asarray(self.matrix) @ x) / 2 + jnp.asarray(self.slope) @ x - self.offset

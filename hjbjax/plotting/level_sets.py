@@ -153,7 +153,7 @@ def turning_surface(
 
     try:
         from plotly import graph_objects
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise ImportError(
             "turning_surface: plotly is not installed: pip install 'hjbjax[plot3d]'; zero_level_set works without it"
         ) from error

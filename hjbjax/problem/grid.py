@@ -21,6 +21,7 @@ from hjbjax.problem.ends import PRESCRIBED, on_face
 from hjbjax.problem.labels import with_unit, words
 from hjbjax.problem.layouts import Layout, Parts
 from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
 from hjbjax.problem.types import Array, DType, Number, Numbers, States
 
@@ -238,6 +239,7 @@ class Grid:
             total = np.multiply.outer(total, share)
         return total
 
+    @own_settings()
     def wrap(self, x: States) -> jax.Array:
         """States with their periodic entries wrapped into [lo, hi); other entries are unchanged."""
         x = _states(x)
@@ -250,6 +252,7 @@ class Grid:
         slack = 8 * np.finfo(float).eps * np.maximum(hi - lo, np.maximum(abs(lo), abs(hi)))  # as in ``_locate``
         return np.any(((x < lo - slack) | (x > hi + slack)) & ~np.array(self.periodic), axis=-1)
 
+    @own_settings()
     def interpolate(self, values: Array, x: States, *, clamp: bool = False) -> jax.Array:
         """Multilinear interpolation of node values, second order; supports ``jit`` and ``vmap``.
 

@@ -166,7 +166,7 @@ def dataset(solution: Any) -> "xarray.Dataset":
     """
     try:
         import xarray
-    except ImportError:
+    except ModuleNotFoundError:
         raise ImportError("Solution.to_xarray needs xarray: pip install 'hjbjax[io]'") from None
     grid, labels, marched = solution.grid, solution.labels, solution.times is not None
     own = ["value", "grid_error", "box_error", "reached", "stopping", "active", "pushing", "time"]
@@ -213,7 +213,7 @@ def netcdf(found: "xarray.Dataset") -> bytes:
         import h5netcdf
         import h5py
         from xarray.backends import H5NetCDFStore
-    except ImportError:
+    except ModuleNotFoundError:
         raise ImportError("Solution.to_netcdf needs h5netcdf: pip install 'hjbjax[io]'") from None
     found = found.rename({name: name.replace("/", "⁄") for name in map(str, found.variables) if "/" in name})
     # HDF5 ends the process if it cannot close a file, for example on a full disk. It therefore writes into memory,

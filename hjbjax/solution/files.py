@@ -181,13 +181,14 @@ def read(
     """
     path = with_suffix(path_of(path, "read"))
     try:
-        status = os.stat(path)
-        if stat.S_ISDIR(status.st_mode):
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
             raise FileError("it is a folder; give a file in it")
-        if not stat.S_ISREG(status.st_mode):  # opening a pipe would block indefinitely
+        if not stat.S_ISREG(mode):  # opening a pipe would block indefinitely
             raise FileError("it is not an ordinary file")
         with open(path, "rb") as file:
-            return rebuild(*_read_archive(file, status.st_size, form, version, plan))
+            size = os.fstat(file.fileno()).st_size  # of the open file, which a writer may have replaced meanwhile
+            return rebuild(*_read_archive(file, size, form, version, plan))
     except FileError as error:
         reason, cause = str(error), error.__cause__ or error
     except OSError as error:

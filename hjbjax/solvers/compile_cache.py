@@ -5,6 +5,8 @@ import re
 import sys
 from pathlib import Path
 
+from hjbjax.solution import placement
+
 SETTINGS = {  # JAX's defaults skip programs that compile in less than a second, and a solve has many of these
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
@@ -35,7 +37,7 @@ def keep_compiled(folder: str | os.PathLike | None = None) -> Path:
       folder: the folder; ``None`` is the user's cache folder, ``~/.cache/hjbjax`` on Linux.
 
     Returns:
-      The folder.
+      The folder, as an absolute path.
 
     Raises:
       OSError: the folder cannot be created or written.
@@ -47,6 +49,7 @@ def keep_compiled(folder: str | os.PathLike | None = None) -> Path:
     import jax
 
     place = user_folder() if folder is None else Path(folder)
+    place = Path(placement.absolute(os.fspath(place)))  # JAX would create the folder again after a change of folders
     place.mkdir(parents=True, exist_ok=True)
     if not os.access(place, os.W_OK):
         raise PermissionError(f"keep_compiled: {place} cannot be written")

@@ -252,8 +252,7 @@ def with_solution(clock: Clock, needed: int, partial: Callable[[Kept | None], So
     try:
         yield
     except Exception as error:
-        # XLA reports exhausted memory by a status in the text, NumPy by the type
-        starved = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+        starved = memory.is_exhausted(error)
         # the package's own errors are complete, and have no value to attach
         if not (starved or isinstance(error, jax.errors.JaxRuntimeError) or CALLBACK in str(error)):
             raise

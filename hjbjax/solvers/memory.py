@@ -29,6 +29,14 @@ from hjbjax.problem.types import DType
 from hjbjax.tracing import checks
 from hjbjax.tracing.dependence import influence
 
+# XLA has one type for all errors, and on a CPU reports an array that cannot be allocated as INTERNAL
+EXHAUSTED = ("RESOURCE_EXHAUSTED", "Out of memory allocating")
+
+
+def is_exhausted(error: Exception) -> bool:
+    """True if an exception reports that memory ran out: NumPy's by its type, XLA's by its text."""
+    return isinstance(error, MemoryError) or any(words in str(error) for words in EXHAUSTED)
+
 
 def peak_bytes(problem: Problem, grid: Grid, method: Method, dtype: DType, *, high_order: bool = False) -> int:
     """Bytes that a solve uses at its peak, from a count of the arrays that live at the same time.

@@ -341,7 +341,10 @@ def test_a_refusal_of_the_solver_is_one_line(solver, error, code):
     assert not os.listdir(".")
 
 
-@pytest.mark.parametrize(("text", "code"), [("RESOURCE_EXHAUSTED: 9 TB", 6), ("INTERNAL: broken", 4)])
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [("RESOURCE_EXHAUSTED: 9 TB", 6), ("INTERNAL: Out of memory allocating 9 bytes.", 6), ("INTERNAL: broken", 4)],
+)
 def test_a_fault_of_the_device_has_a_code(solver, text, code):
     import jax
 
@@ -778,14 +781,24 @@ def test_nothing_is_kept_where_nobody_wants_it_or_nothing_can_be(tmp_path):
     assert (done.returncode, left) == (0, set())
 
 
-def test_one_line_keeps_what_is_compiled(tmp_path):
-    script = "import hjbjax as hjb, jax, sys; print(hjb.keep_compiled(sys.argv[1])); jax.jit(lambda x: x + 1)(1.0)"
-    place = tmp_path / "mine"
+def test_one_line_keeps_what_is_compiled_in_one_folder(tmp_path):
+    script = (
+        "import hjbjax as h, jax, os; print(h.keep_compiled('mine')); os.chdir('other'); jax.jit(lambda x: -x)(1.0)"
+    )
+    (tmp_path / "other").mkdir()
     kept = {key: value for key, value in environment().items() if "COMPILATION_CACHE" not in key}
-    words = [sys.executable, "-c", script, str(place)]
-    done = subprocess.run(words, capture_output=True, text=True, env=kept, timeout=120)
-    assert done.stdout == f"{place}\n", done.stderr
-    assert list(place.glob("*-cache"))
+    words = [sys.executable, "-c", script]
+    done = subprocess.run(words, capture_output=True, text=True, env=kept, timeout=120, cwd=tmp_path)
+    assert done.stdout == f"{tmp_path / 'mine'}\n", done.stderr
+    assert list((tmp_path / "mine").glob("*-cache"))
+    assert list((tmp_path / "other").iterdir()) == []
+
+
+def test_a_removed_current_folder_keeps_nothing_compiled(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tmp_path.rmdir()
+    with pytest.raises(hjbjax.FileError, match="the current folder has been removed"):
+        hjbjax.keep_compiled("mine")
 
 
 def test_a_folder_that_cannot_be_made_is_said(tmp_path):

@@ -208,6 +208,12 @@ def test_a_bad_environment_is_refused_in_one_line(name, value, wanted, tmp_path,
     refused(("solve", "pendulum"), "unset all of them to solve in one process")
 
 
+@pytest.mark.parametrize("port", ["4_000", "٤٠٠٠", "04000"])
+def test_a_port_is_passed_on_as_a_number(port, monkeypatch):
+    as_member(monkeypatch, **{launch.COORDINATOR: f"127.0.0.1:{port}"})
+    assert launch.member().coordinator == "127.0.0.1:4000"
+
+
 def test_devices_that_are_not_the_same_number_in_each_process(monkeypatch):
     as_member(monkeypatch)
     refused(("solve", "pendulum", "--devices", "3"), "3 devices cannot be the same number in each of 2 processes")

@@ -112,11 +112,17 @@ def out_of_memory(*_):
     raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 648361672 bytes.")
 
 
+def no_room_for_a_result(*_):
+    raise jax.errors.JaxRuntimeError("INTERNAL: Error dispatching computation: Out of memory allocating 1080 bytes.")
+
+
 def plain(discount=1.0):
     return hjb.Problem(lambda x, u: u, cost, U, discount=discount)
 
 
-@pytest.mark.parametrize("error", [out_of_memory, lambda *_: np.empty(2**55)], ids=["JAX", "NumPy"])
+@pytest.mark.parametrize(
+    "error", [out_of_memory, no_room_for_a_result, lambda *_: np.empty(2**55)], ids=["JAX", "dispatch", "NumPy"]
+)
 def test_memory_that_runs_out(monkeypatch, error):
     monkeypatch.setattr(stationary_run, "run", error)
     guess = np.arange(9.0)

@@ -257,6 +257,25 @@ def test_an_answer_does_not_depend_on_an_option_that_is_left_to_the_caller(door,
         check(door, setting, OTHERS[setting])
 
 
+PLANE = hjb.Grid([0.0, -1.0], [2.0, 1.0], (8, 9), periodic=(True, False), stretch=(None, hjb.Sinh(2.0, 0.1)))
+STATES = np.array([[-0.3, 0.2], [2.5, -0.7], [1.0, 0.0]])
+CONVEX = [hjb.convex.box([-1, -1], [1.0, 2.0]), hjb.convex.ellipsoid([0.1, 0], [[2, 0], [0, 1.0]])]
+
+
+def direct_calls():
+    lookups = [PLANE.interpolate(PLANE.nodes(), STATES), PLANE.interpolate(np.eye(8, 9), STATES[0])]
+    return arrays(PLANE.wrap(STATES), lookups, [convex(STATES[0]) for convex in CONVEX])
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_grids_and_convex_functions_do_not_depend_on_a_setting(setting):
+    rounding = 1e-6 if setting == "64_bits" else 0
+    with caller(SETTINGS[setting]):
+        found = direct_calls()
+    for got, known in zip(found, direct_calls(), strict=True):
+        np.testing.assert_allclose(got, known, rtol=rounding, atol=rounding)
+
+
 def is_own(function, module):
     """True if a file without ``__all__`` defines a public function."""
     return function.__module__ == module.__name__ and not function.__name__.startswith("_")

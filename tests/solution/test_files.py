@@ -418,6 +418,26 @@ def test_code_in_a_file_never_runs(tmp_path):
     assert not mark.exists()
 
 
+@pytest.mark.parametrize("moment", ["stat", "fstat"])
+def test_a_file_that_is_replaced_while_it_is_opened_is_read_whole(tmp_path, monkeypatch, moment):
+    """A reader sees the old or the new file, although the new one is longer."""
+    path, longer = tmp_path / "run.npz", tmp_path / "longer.npz"
+    old, new = example(residuals=np.zeros(2)), example(residuals=np.zeros(10**4))
+    old.save(path)
+    new.save(longer)
+    look, writers = getattr(os, moment), [longer]
+
+    def replace_and_look(place, *arguments, **options):
+        found = look(place, *arguments, **options)
+        if writers and (moment == "fstat" or place == str(path)):
+            writers.pop().rename(path)
+        return found
+
+    monkeypatch.setattr(os, moment, replace_and_look)
+    assert_same(load(str(path)), {"stat": new, "fstat": old}[moment])
+    assert_same(load(str(path)), new)
+
+
 def test_a_claim_of_eight_terabytes(tmp_path, monkeypatch):
     path = tmp_path / "run.npz"
     huge = {"shape": [10**6, 10**6], "periodic": [False, False], "names": ["a", "b"], "stretch": [None, None]}

@@ -106,6 +106,16 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("package", ["xarray", "h5netcdf"])
+def test_a_package_that_cannot_be_loaded_is_not_called_missing(package, tmp_path, monkeypatch):
+    """Its own reason is raised, for example that memory ran out."""
+    (tmp_path / f"{package}.py").write_text("raise ImportError('failed to map segment from shared object')")
+    monkeypatch.delitem(sys.modules, package, raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ImportError, match=r"^failed to map segment"):
+        solved().to_netcdf(tmp_path / "run.nc")
+
+
 def test_a_slash_in_a_name_makes_no_group(tmp_path):
     pytest.importorskip("h5netcdf")
     problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)

@@ -32,7 +32,11 @@ def __getattr__(name: str) -> "Any":
             return found
         if name in globals():  # a subpackage that has been imported meanwhile
             return globals()[name]
-    # with ``name=``, from which Python derives its suggestion
+        from hjbjax.problem import words
+
+        if name.lower() in words.OF_PACKAGE:
+            raise AttributeError(words.missing(f"module {__name__!r}", name, words.OF_PACKAGE), name=name)
+    # with ``name=`` and ``obj=``, from which Python derives its suggestion
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
 

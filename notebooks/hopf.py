@@ -46,10 +46,12 @@ assert upper - lower < 0.01
 # %%
 path = hjb.simulate(problem, solution.control_at, start, 3.0, time_varying=True, hold=0.05)
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
-axes[0].plot(path.times, path.states[:, :carts])
+axes[0].plot(path.times, path.states[:, :carts], label=[f"cart {i + 1}" for i in range(carts)])
 axes[0].set(xlabel="t", ylabel="positions")
-axes[1].step(path.times[:-1], path.controls, where="post")
+axes[1].step(path.times[:-1], path.controls, where="post", label=["first cart", "last cart"])
 axes[1].set(xlabel="t", ylabel="forces")
+for axis in axes:
+    axis.legend(frameon=False)
 plt.show()
 print(f"cost of the path {float(path.cost):.4f}")
 assert abs(float(path.cost) - solution.value_at(0.0, start)) < 0.05
@@ -67,7 +69,7 @@ value = solution.value_at(0.0, states)
 figure, axis = plt.subplots(figsize=(4.6, 3.8), layout="constrained")
 shades = axis.contourf(positions, positions, value.T, 15)
 axis.contour(positions, positions, value.T, [0.0], colors="white")
-axis.set(xlabel="first cart", ylabel="last cart", aspect="equal")
+axis.set(xlabel="position of the first cart", ylabel="position of the last cart", aspect="equal", title="white: V = 0")
 figure.colorbar(shades, label="V")
 plt.show()
 assert value.min() < 0 < value.max()

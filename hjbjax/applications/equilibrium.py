@@ -15,6 +15,9 @@ With parameters θ, E(r, θ) = 0, so the implicit function theorem gives
 
 with the derivatives of ``solve`` and of ``stationary_law``, each of which is a linear solve. The steps of the search
 are not differentiated.
+
+The law of a chain is of first order in the spacing, so on a usual grid the price has a much larger error than V. It is
+estimated by one more population at the same price on a coarser grid, |E_coarse − E| / |∂E/∂r|.
 """
 
 import dataclasses
@@ -43,13 +46,16 @@ from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import Array, Nodes, Number
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import keeping_warnings, warn
+from hjbjax.solvers import nested_grids
 from hjbjax.solvers.stationary import solve
 from hjbjax.tracing.closures import holds_tracers, settled
 
+COARSE = 0.1  # grid error that is worth a warning, relative to the price and to the width of the bracket
+APART = 1e-3  # distance of two prices for the slope of the excess, as a fraction of the bracket
 MOST = 100  # evaluations: bisection needs 20 for 1e-6, and the search at most about three times as many
 
 
-@pytree_dataclass(host=("tried",))
+@pytree_dataclass(host=("tried", "grid_error"))
 class Equilibrium:
     """A price with the solution, the law and the excess of the population at this price.
 
@@ -59,6 +65,8 @@ class Equilibrium:
       solution: the ``Solution`` of the problem at this price.
       law: the stationary law under its policy, one probability per node, in the shape of ``solution.value``.
       tried: the prices that were tried and their excess, shape (k, 2), in order; empty on return from ``jit``.
+      grid_error: an estimate of the discretisation error of the price from a coarser grid, of first order in the
+        spacing. ``None`` on return from ``jit``, and if no coarser grid has a population at this price.
     """
 
     price: Any
@@ -66,12 +74,14 @@ class Equilibrium:
     solution: Solution
     law: Array
     tried: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
+    grid_error: float | None = None
 
     def __repr__(self) -> str:
         if is_traced(self.price) or np.ndim(self.price):
             return f"Equilibrium(price={self.price}, excess={self.excess})"
         solves = f" after {len(self.tried)} solves" if len(self.tried) else ""
-        return f"Equilibrium(price {float(self.price):.9g}, excess {float(self.excess):.2g}{solves})"
+        error = "" if self.grid_error is None else f", grid error about {self.grid_error:.2g}"
+        return f"Equilibrium(price {float(self.price):.9g}{error}, excess {float(self.excess):.2g}{solves})"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +102,11 @@ class _Economy:
 
     def at(self, price: Any, guess: Nodes | None) -> Equilibrium:
         """The population at one price, in equilibrium or not."""
+        solution, law = self.population(price, guess)
+        return Equilibrium(price, self.excess_of(price, solution, law), solution, law)
+
+    def population(self, price: Any, guess: Nodes | None) -> tuple[Solution, Array]:
+        """The solution at one price and the law under its policy."""
         problem = self.problem_of(price)
         if not isinstance(problem, Problem):
             raise TypeError(f"equilibrium: problem_of({price}) returned {problem!r:.60}, wanted a Problem")
@@ -107,9 +122,9 @@ class _Economy:
         law = chain.stationary_law(
             problem, self.grid, solution.policy, disturbance=solution.disturbance, scheme=self.scheme
         )
-        return Equilibrium(price, self._excess(price, solution, law), solution, law)
+        return solution, law
 
-    def _excess(self, *found: Any) -> Any:
+    def excess_of(self, *found: Any) -> Any:
         """The excess as one number; in double precision on the host."""
         with own_settings(x64=None if is_traced(found) else True):
             excess = self.excess(*found)
@@ -136,6 +151,9 @@ def equilibrium(
 
     E(r) = excess(r, V_r, μ_r) = 0, where V_r solves ``problem_of(r)`` and μ_r is the stationary law under its policy.
     The price may be any number in the problem: an interest rate, a wage, a tax.
+
+    One more population on a coarser grid gives ``grid_error``, an estimate of the discretisation error of the price. It
+    is of first order in the spacing. A warning says so if it exceeds a tenth of the price and of the bracket.
 
     E must be continuous with one change of sign in the bracket. Searched optima, as for u^γ, have small errors that
     limit the accuracy of E; optima by formulas do not.
@@ -261,7 +279,61 @@ def _on_host(economy: _Economy, lo: float, hi: float, tol: float) -> Equilibrium
     best = int(np.argmin(np.abs(tried[:, 1])))
     for warning in warnings[best]:  # other prices are not part of the result
         warn(warning)
-    return dataclasses.replace(found[best], tried=tried)
+    error = _grid_error(economy, found[best], tried, hi - lo)
+    if error is not None and error > COARSE * max(hi - lo, abs(found[best].price)):
+        warn(
+            f"equilibrium: the grid is coarse for this price: the error of the price is about {error:.2g} "
+            "(Equilibrium.grid_error). Use more nodes, or concentrate nodes where many members of the population are, "
+            "such as at a limit: Grid(..., stretch=)"
+        )
+    return dataclasses.replace(found[best], tried=tried, grid_error=error)
+
+
+def _grid_error(economy: _Economy, found: Equilibrium, tried: np.ndarray, width: float) -> float | None:
+    """An estimate of the error of the price from the population on a coarser grid; None if there is none."""
+    coarse = nested_grids.coarser(economy.grid)
+    apart = np.abs(tried[:, 0] - found.price)
+    far = apart >= min(APART * width, apart.max())  # the excess of closer prices has few digits left
+    other = tried[far][np.argmin(apart[far])]
+    slope = (other[1] - found.excess) / (other[0] - found.price)
+    if coarse is None or not np.isfinite(slope) or slope == 0:
+        return None
+    try:
+        with keeping_warnings():  # they are about a grid that the user has not chosen
+            rough, law = dataclasses.replace(economy, grid=coarse).population(found.price, None)
+    except (ValueError, SolveError):
+        return None
+    # on the nodes of the user's grid, because the user's function may read their coordinates
+    fine = found.solution.grid
+    moved = dataclasses.replace(
+        found.solution,
+        value=nested_grids.prolong(np.asarray(rough.value), rough.grid, fine),
+        policy=_prolonged(rough.policy, rough.grid, fine),
+        disturbance=None if rough.disturbance is None else _prolonged(rough.disturbance, rough.grid, fine),
+    )
+    excess = economy.excess_of(found.price, moved, _shared_out(np.asarray(law), rough.grid, fine))
+    return abs((excess - found.excess) / slope)
+
+
+def _prolonged(actions: Array, coarse: Grid, fine: Grid) -> np.ndarray:
+    """The actions (*coarse, m) of a player between the nodes, (*fine, m)."""
+    inputs = np.moveaxis(np.asarray(actions), -1, 0)
+    shape = (len(inputs), *fine.shape)
+    return np.moveaxis(np.reshape([nested_grids.prolong(each, coarse, fine) for each in inputs], shape), 0, -1)
+
+
+def _shared_out(law: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
+    """A law (*coarse,) as a law (*fine,): each probability goes to the two next nodes, so that means stay the same."""
+    for axis in fine.state_axes:
+        nodes, x = np.asarray(fine.axis(axis)), np.asarray(coarse.axis(axis))
+        nodes = np.append(nodes, float(fine.hi[axis])) if fine.periodic[axis] else nodes
+        cell = np.clip(np.searchsorted(nodes, x, side="right") - 1, 0, len(nodes) - 2)
+        share = np.clip((x - nodes[cell]) / (nodes[cell + 1] - nodes[cell]), 0, 1)
+        matrix = np.zeros((fine.shape[axis], len(x)))
+        np.add.at(matrix, (cell, np.arange(len(x))), 1 - share)
+        np.add.at(matrix, ((cell + 1) % fine.shape[axis], np.arange(len(x))), share)
+        law = np.moveaxis(np.tensordot(matrix, law, (1, axis)), 0, axis)
+    return law
 
 
 # --- inside a transformation ---

@@ -31,6 +31,7 @@ from hjbjax.plotting.maps import closed_loop_size
 from hjbjax.plotting.slices import at_states
 from hjbjax.plotting.style import NARROW, save_figure
 from hjbjax.problem import streams
+from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.mode_axis import in_mode, without_modes
 from hjbjax.problem.problem import Problem, is_random
@@ -45,7 +46,8 @@ if TYPE_CHECKING:
 
 FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # the types of JSON
-SAMPLES = 400  # samples of a bang-bang feedback along its trajectory
+SAMPLES = 400  # most samples of a bang-bang feedback along its trajectory
+FEWEST = 40  # fewest samples; with fewer the path would pass a small target
 DPI = 160
 NAME = 40  # characters of a folder's name that are repeated in the name of a new folder next to it
 
@@ -262,6 +264,8 @@ def closed_path(
 
     If the control jumps or is a direction, the mean of two controls is not optimal, so the Hamiltonian is minimised at
     every state. A control that jumps is sampled, because an adaptive integrator is very slow along a switching curve.
+    On a curve along which the path slides, the side of a state is known only up to a cell, so the control chatters if
+    it is sampled several times per cell. A second simulation holds it for the time in which the path crosses a cell.
     """
     # a fixed key, so that the same path is drawn every time
     options: dict[str, Any] = {"key": 0} if is_random(problem) else {}
@@ -275,6 +279,9 @@ def closed_path(
         problem = dataclasses.replace(problem, exit_cost=None)
     try:
         path = simulate(problem, feedback, start, duration, **options)
+        if jumps and not is_random(problem):
+            options["hold"] = crossing_time(path, solution.grid, duration)
+            path = simulate(problem, feedback, start, duration, **options)
         if finish is None or path.reached is None:
             return path
         rest_problem, rest_feedback = finish
@@ -283,6 +290,15 @@ def closed_path(
     except ValueError as error:  # for example a start outside a box that parameters made smaller
         streams.warn_safely(f"no trajectory.png: {error}", UserWarning, stacklevel=2)
         return None
+
+
+def crossing_time(path: Trajectory, grid: Grid, duration: float) -> float:
+    """The median time in which a path crosses a cell of the grid, between ``duration`` / 400 and ``duration`` / 40."""
+    spacings = np.array([float(grid.spacing(axis)) for axis in grid.state_axes])
+    cells = np.max(np.abs(np.diff(np.asarray(path.states), axis=0)) / spacings, axis=-1)
+    moves = cells > 0
+    times = np.diff(np.asarray(path.times))[moves] / cells[moves]
+    return float(np.clip(np.median(times), duration / SAMPLES, duration / FEWEST)) if times.size else duration / SAMPLES
 
 
 class _Part(NamedTuple):

@@ -8,10 +8,11 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
-from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_ways_out
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Simplex, holds
 from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array
+from hjbjax.problem.words import OF_PATH
 from hjbjax.solution.status import warn
 
 MANY = 1000  # internal steps: with more, and more than an eighth of max_steps, the feedback probably jumps
@@ -53,6 +54,7 @@ class Interrupted(KeyboardInterrupt):
         self.path = path
 
 
+@with_ways_out(OF_PATH)
 @pytree_dataclass(static=("held", "payoff"), host=("message",))
 class Path:
     """The history of a closed loop, truncated at its end.

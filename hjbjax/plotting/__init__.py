@@ -11,6 +11,8 @@ periodic axis is closed at its seam. Names and units come from ``Grid(names=, un
 ticks at multiples of π. If a solution carries its problem, its target is outlined.
 """
 
+from typing import TYPE_CHECKING, NoReturn
+
 from hjbjax.plotting.enclosures import enclosure
 from hjbjax.plotting.estimates import density, estimates
 from hjbjax.plotting.histories import controls, costates
@@ -19,6 +21,7 @@ from hjbjax.plotting.maps import closed_loop, policy, switching_curve, trajector
 from hjbjax.plotting.studies import convergence, perturbation, residuals
 from hjbjax.plotting.style import COLOURS, GREY, Picture, styled
 from hjbjax.plotting.surfaces import level_surface
+from hjbjax.problem import words
 
 __all__ = [
     "COLOURS",
@@ -44,3 +47,9 @@ __all__ = [
     "value",
     "zero_level_set",
 ]
+
+if not TYPE_CHECKING:  # otherwise type checkers would accept any name
+
+    def __getattr__(name: str) -> NoReturn:
+        """Refuse a name that does not exist, with the way out; Python calls this function for no other name."""
+        raise AttributeError(words.missing(f"module {__name__!r}", name, words.OF_PLOTTING, __all__), name=name)

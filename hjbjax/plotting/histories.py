@@ -115,7 +115,8 @@ def controls(
             mean = _running_mean(times, inputs[:, i], width)
             look = {"color": look["color"], "linewidth": 1.4}
             means += ax.plot(times, mean, label=f"{name}, mean over {width:.2g}", **look)
-    label_axes(ax, time_label(None if solution is None else solution.grid), names[0] if count == 1 else "control")
+    time = time_label(None if solution is None else solution.grid, words.control_units)
+    label_axes(ax, time, names[0] if count == 1 else "control")
     set_ticks(ax.xaxis, False)
     set_ticks(ax.yaxis, False)
     span = max((span_of(solution, i) for i in range(count)), default=0.0) if solution is not None else 0.0

@@ -299,7 +299,7 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     # smaller than its frame, otherwise the label on the right would be cut off
     ax.set_box_aspect(box_sides(grid, free), zoom=0.86)
     if caption := _caption(field, fixed):
-        ax.set_title(caption, loc="right", fontsize=9)
+        ax.set_title(caption, loc="right", fontsize=9, y=0.9)  # next to the box, which does not fill the axes
     if label and artists:
         ax.plot([], [], [], color=color, linewidth=4, alpha=OPACITY, label=label)
         ax.legend(frameon=False, fontsize=8)

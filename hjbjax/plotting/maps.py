@@ -33,6 +33,8 @@ from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Number, State
 
+SMOOTHING = 1.5  # width of the mean of signs at a switching curve, in cells
+
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
@@ -132,7 +134,8 @@ def policy(
     """Plot one input of the feedback u(x): a line over one axis, colours over two axes.
 
     If the input changes sign, the colours diverge at zero. A feedback that jumps or is enumerated is drawn as cells,
-    any other feedback smoothly. Nodes without a control or without a finite value are hatched.
+    any other feedback smoothly. Nodes without a control or without a finite value are hatched. Where it is optimal to
+    stop or to push no control acts, so none is drawn there.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
@@ -143,6 +146,7 @@ def policy(
     """
     section, label = feedback(solution, input, fixed, time)
     ax = axes_of(ax)
+    decided = decided_sets(solution, section, time)
     section, regions = _without(section, target_of(solution, time))
     cells = described(solution).discrete or jumps(section.values.compressed())
     span = span_of(solution, input)
@@ -154,8 +158,11 @@ def policy(
     if hidden and len(section.axes) == 1 and target is not None:
         within = at_states(target, section.states(section.coordinates))[inner] <= 0
         hidden = "target" if within[lost].all() else hidden
-    look = Look(label, hidden, colorbar, diverging=True, cells=cells, span=span)
-    return Picture(draw(ax, section, look, regions) + _stopped(ax, solution, section, time), ax)
+    idle = np.any([inside for inside, _ in decided.values()], axis=0) if decided else None
+    look = Look(label, hidden, colorbar, diverging=True, cells=cells, span=span, idle=idle)
+    artists = draw(ax, section, look, regions)
+    artists += [each for name, found in decided.items() for each in dot_region(ax, section, *found, name, cover=True)]
+    return Picture(artists, ax)
 
 
 @drawing
@@ -171,9 +178,10 @@ def switching_curve(
 ) -> Picture:
     """Plot the curve on which one input changes sign: the zero level of the feedback, linear between nodes.
 
-    A bang-bang feedback jumps between two nodes, so the curve is accurate to half a cell. A continuous feedback crosses
-    zero without a switch, and its curve is arbitrary where the feedback is nearly zero. Over one axis the zeros are
-    drawn as vertical lines.
+    A bang-bang feedback jumps between two nodes, so the curve is accurate to half a cell. Its signs are averaged over
+    the neighbours before the zero level is drawn, otherwise the curve would be a staircase of half cells. A continuous
+    feedback crosses zero without a switch, and its curve is arbitrary where the feedback is nearly zero. Over one axis
+    the zeros are drawn as vertical lines.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
@@ -198,12 +206,23 @@ def switching_curve(
         artists: list[Artist] = [ax.axvline(x, **style) for x in zeros(section.coordinates[0], section.values)]
     else:
         x, y = section.coordinates
-        artists = [ax.contour(x, y, section.values.T, levels=[0.0], colors=color, linewidths=1.6)]
+        level = _mean_signs(section.values) if jumps(known) else section.values
+        artists = [ax.contour(x, y, level.T, levels=[0.0], colors=color, linewidths=1.6)]
     frame(ax, section)
     if label:  # on an empty line, because contours cannot have a label
         artists += ax.plot([], [], label=label, **style)
         legend(ax)
     return Picture(artists, ax)
+
+
+def _mean_signs(values: np.ma.MaskedArray) -> np.ma.MaskedArray:
+    """Signs averaged over the known neighbours with Gaussian weights; the zero level at a straight line is straight."""
+    from scipy.ndimage import gaussian_filter
+
+    mask = np.ma.getmaskarray(values)
+    signs = np.where(mask, 0.0, np.sign(values))
+    total, weight = (gaussian_filter(field, SMOOTHING, mode="nearest") for field in (signs, 1.0 - mask))
+    return np.ma.array(total / np.where(mask, 1.0, weight), mask=mask)
 
 
 @drawing

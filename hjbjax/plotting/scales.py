@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from hjbjax.problem.grid import Grid
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+PER_TIME = re.compile(r"/ ?(s|min|h|hour|day|week|month|year)\b")  # a rate, but not m/s²
 LENGTHS = ("m", "km", "cm", "mm", "µm", "um", "nm", "ft", "in", "mi", "nmi", "nautical miles", "au", "AU")
 ANGLES = ("rad", "radian", "radians")
 FEWEST, MOST = 3, 7  # ticks of an angle; with fewer, decimals are better than fractions of π
@@ -69,15 +71,20 @@ def place_text(grid: Grid, axis: int, place: float) -> str:
     return (angle_text(place) if simple else f"{place:.4g}") + unit
 
 
-def time_label(grid: Grid | None) -> str:
-    """The label of a time axis, with seconds if a state is measured per second.
+def time_label(grid: Grid | None, control_units: Iterable[str] = ()) -> str:
+    """The label of a time axis, with the unit of time in which a state or a control is measured, such as m/s or 1/year.
 
     Example:
       >>> time_label(Grid([0.0], [1.0], (4,), units=("m/s",))), time_label(Grid([0.0], [1.0], (4,)))
       ('t [s]', 't')
+      >>> time_label(None, ("1/year",))
+      't [year]'
     """
-    per_second = grid is not None and any("/s" in unit for unit in grid.units)
-    return "t [s]" if per_second else "t"
+    for unit in (*(() if grid is None else grid.units), *control_units):
+        found = PER_TIME.search(unit)
+        if found:
+            return f"t [{found[1]}]"
+    return "t"
 
 
 def are_positions(grid: Grid, axes: Sequence[int]) -> bool:

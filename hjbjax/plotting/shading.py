@@ -39,6 +39,7 @@ class Look:
       diverging: put zero in the middle of the colours if both signs occur.
       cells: draw nodes as cells instead of shading smoothly.
       span: the range of the numbers; a variation below ``FLAT`` times the span counts as zero. 0 if unknown.
+      idle: the nodes whose numbers are not shown because no control acts there, bool, in the shape of the section.
     """
 
     label: str
@@ -47,15 +48,22 @@ class Look:
     diverging: bool = False
     cells: bool = False
     span: float = 0.0
+    idle: np.ndarray | None = None
+
+    def shown(self, section: Section) -> np.ma.MaskedArray:
+        """The numbers to show, with idle nodes masked."""
+        values = section.values
+        return values if self.idle is None else np.ma.array(values, mask=np.ma.getmaskarray(values) | self.idle)
 
 
 def draw(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...] = ()) -> list[Artist]:
     """Draw one section as a line or as a colour mesh, hatch hidden nodes, and outline the regions."""
     mask = np.ma.getmaskarray(section.values)
     if len(section.axes) == 1:
-        artists: list[Artist] = [*ax.plot(section.coordinates[0], section.values, color=COLOURS[0], linewidth=1.6)]
+        line = look.shown(section)
+        artists: list[Artist] = [*ax.plot(section.coordinates[0], line, color=COLOURS[0], linewidth=1.6)]
         artists += bands(ax, section.coordinates[0], mask, look.hidden) if look.hidden else []
-        known = section.values.compressed()
+        known = line.compressed()
         if known.size and is_level(known, look.span):  # otherwise the axis would show rounding errors
             ax.set_ylim(*limits_around(float(np.mean(known)), look.span))
         frame(ax, section, look.label)
@@ -90,7 +98,7 @@ def jumps(known: np.ndarray) -> bool:
 def _mesh(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...]) -> list[Artist]:
     """Draw a section over two axes; the mesh is the first artist, then hatches and outlines."""
     values, mask = section.values, np.ma.getmaskarray(section.values)
-    known = values.compressed()
+    known = look.shown(section).compressed()
     lo, hi, colours = _colours(known, look)
     # rasterized, because a mesh of 200 x 200 as vectors gives a PDF with 40 000 rectangles
     style: dict[str, Any] = {"cmap": colours, "vmin": lo, "vmax": hi, "rasterized": True}
@@ -191,13 +199,18 @@ def outlined(ax: Axes, region: Region, *, inside: bool = True) -> list[Artist]:
     return artists
 
 
-def dot_region(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray, name: str) -> list[Artist]:
+def dot_region(
+    ax: Axes, section: Section, inside: np.ndarray, values: np.ndarray, name: str, *, cover: bool = False
+) -> list[Artist]:
     """Dot the part of a section where it is optimal to stop or push, up to the free boundary, and name it.
 
     Args:
       inside: True for nodes of the set, of the shape of the section.
       values: V at the same nodes.
       name: the label of the set.
+
+    Keyword Args:
+      cover: hide the colours under the dots.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
@@ -213,7 +226,7 @@ def dot_region(ax: Axes, section: Section, inside: np.ndarray, values: np.ndarra
         for k, (left, right) in enumerate(zip(ends[::2], ends[1::2], strict=True)):
             artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k or named else name, **style))
     else:
-        area: Any = {"levels": [0.0, 1.0], "colors": "none", "hatches": [DOTS], "zorder": 2}
+        area: Any = {"levels": [0.0, 1.0], "colors": "white" if cover else "none", "hatches": [DOTS], "zorder": 2}
         dots = ax.contourf(*section.coordinates, inside.T - 0.5, **area)
         dots.set(edgecolor=STROKE, linewidth=0.0)
         segments = segments_of(section.coordinates, values, inside, (None, None))

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from hjbjax.problem.arguments import shown
 from hjbjax.problem.pytree import front_door
+from hjbjax.problem.words import shown
 from hjbjax.solution.files import Path, write_whole
 from hjbjax.solution.placement import path_of
 

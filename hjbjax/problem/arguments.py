@@ -22,6 +22,7 @@ from hjbjax.problem.layouts import FEWEST
 from hjbjax.problem.pytree import is_traced, numbers
 from hjbjax.problem.stretching import Sinh, Stretching
 from hjbjax.problem.types import Array, DType, Key
+from hjbjax.problem.words import shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,7 +30,6 @@ T = TypeVar("T")
 COINCIDING = 16  # units in the last place of a coordinate; every spacing must be larger
 INDEXABLE = 2**31  # nodes that 32-bit indices can number
 NO_GRID = "hjb.pontryagin(problem, x0) finds the optimal path from one state without a grid"
-SHOWN = 80  # characters of a refused value to quote
 EDGES = ("projected", "constrained", "open", "linear")  # ends without numbers: static, hashable, saved as names
 Ends = tuple[str, str] | None  # the kinds of the lower and the upper end of an axis; None for a periodic axis
 
@@ -157,12 +157,6 @@ def is_number(value: object) -> bool:
     return array.ndim == 0 and array.dtype.kind in "fiu"
 
 
-def shown(value: object) -> str:
-    """A value for a message: its ``repr`` on one line of at most ``SHOWN`` characters."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= SHOWN else text[: SHOWN - 4] + " ..."
-
-
 def axis_names(given: object, count: int) -> tuple[str, ...]:
     """One name per axis; x1, x2, ... by default.
 
@@ -255,7 +249,7 @@ def corner(value: object, name: str) -> Array:
     """One corner of the box: one number per axis."""
     corner = numbers(value, f"Grid.{name}")
     if np.ndim(corner) != 1 or np.size(corner) == 0:
-        raise ValueError(f"Grid.{name}: got {value!r}, wanted a list of numbers, one per axis")
+        raise ValueError(f"Grid.{name}: got {shown(value)}, wanted a list of numbers, one per axis")
     return corner
 
 

@@ -20,15 +20,17 @@ from hjbjax.problem import arguments
 from hjbjax.problem.ends import PRESCRIBED, on_face
 from hjbjax.problem.labels import with_unit, words
 from hjbjax.problem.layouts import Layout, Parts
-from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass
+from hjbjax.problem.pytree import altered, is_traced, known, pytree_dataclass, with_ways_out
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.stretching import Stretching, checked_table, from_table, into_period
 from hjbjax.problem.types import Array, DType, Number, Numbers, States
+from hjbjax.problem.words import OF_GRID
 
 CONTINUED = ("open", "linear", "robin")  # kinds of ends beyond which V is extended
 TABLED = 2**24  # points of an axis with a stored table, 128 MiB; a larger grid must not allocate before it is refused
 
 
+@with_ways_out(OF_GRID)
 @pytree_dataclass(static=("shape", "periodic", "names", "edges", "units", "modes"))
 class Grid:
     """A grid of nodes on a box in R^n, uniform along every axis that is not stretched.
@@ -284,6 +286,12 @@ class Grid:
         hidden = jnp.any(jnp.isnan(x), axis=-1) | ((not clamp) & ~jnp.all(jnp.stack(inside), axis=0))
         return jnp.where(hidden.reshape(hidden.shape + trailing), jnp.nan, total)
 
+    def slack(self, axis: int, dtype: DType) -> jax.Array:
+        """The rounding error of a position in cells, for coordinates of the size of the ends, with a margin."""
+        lo, hi = jnp.asarray(self.lo[axis], dtype), jnp.asarray(self.hi[axis], dtype)
+        size = jnp.maximum(1, jnp.maximum(abs(lo), abs(hi)) / (hi - lo))
+        return 8 * self.intervals(axis) * jnp.finfo(dtype).eps * size
+
     def _locate(self, axis: int, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """The node below ``x``, the fraction of the distance to the next node, and True if ``x`` is in the box."""
         lo, hi, last = jnp.asarray(self.lo[axis], x.dtype), jnp.asarray(self.hi[axis], x.dtype), self.intervals(axis)
@@ -291,8 +299,7 @@ class Grid:
         if self.stretch[axis] is not None:
             return self._locate_stretched(axis, x, place)
         place = place * last
-        # the rounding error of a position in cells, for coordinates of the size of the ends, with a margin
-        slack = 8 * last * jnp.finfo(x.dtype).eps * jnp.maximum(1, jnp.maximum(abs(lo), abs(hi)) / (hi - lo))
+        slack = self.slack(axis, x.dtype)
         inside = (place >= -slack) & (place <= last + slack)  # NaN counts as outside
         place = jnp.clip(jnp.nan_to_num(place), 0, last)
         # snap to a node, so that an infinite neighbour has weight exactly zero; the derivative is unchanged

@@ -7,6 +7,7 @@ import numpy as np
 
 from hjbjax.problem.pytree import as_partial, numbers, pytree_dataclass
 from hjbjax.problem.types import Number
+from hjbjax.problem.words import shown
 
 
 @pytree_dataclass()
@@ -62,18 +63,18 @@ class Jump:
     ):
         if not callable(landing):
             raise TypeError(
-                f"Jump.landing: got {landing!r}, wanted a function (x, u) -> (n,), the state after the jump"
+                f"Jump.landing: got {shown(landing)}, wanted a function (x, u) -> (n,), the state after the jump"
             )
         object.__setattr__(self, "rate", _number_or_function(rate, "Jump.rate"))
         object.__setattr__(self, "landing", as_partial(landing, "Jump.landing"))
         if isinstance(self.rate, np.ndarray) and not 0 <= self.rate < np.inf:
-            raise ValueError(f"Jump.rate: got {rate!r}, wanted a finite number ≥ 0, per unit time, or a function")
+            raise ValueError(f"Jump.rate: got {shown(rate)}, wanted a finite number ≥ 0, per unit time, or a function")
         if cost is not None and reward is not None:
             raise ValueError("Jump: got both cost and reward, wanted at most one of them, for each jump")
         for name, given in {"cost": cost, "reward": reward}.items():
             paid = None if given is None else _number_or_function(given, f"Jump.{name}")
             if isinstance(paid, np.ndarray) and not np.isfinite(paid):
-                raise ValueError(f"Jump.{name}: got {given!r}, wanted a finite number, or a function")
+                raise ValueError(f"Jump.{name}: got {shown(given)}, wanted a finite number, or a function")
             object.__setattr__(self, name, paid)
 
 
@@ -84,7 +85,7 @@ def check_jumps(jumps: object) -> tuple[Jump, ...]:
       TypeError: something that is not a list of jumps.
     """
     if not isinstance(jumps, (list, tuple)) or not all(isinstance(jump, Jump) for jump in jumps):
-        raise TypeError(f"Problem.jumps: got {jumps!r}, wanted a list, as in [hjb.Jump(rate, landing)]")
+        raise TypeError(f"Problem.jumps: got {shown(jumps)}, wanted a list, as in [hjb.Jump(rate, landing)]")
     return tuple(jumps)
 
 

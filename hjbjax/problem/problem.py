@@ -24,6 +24,7 @@ from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_datacla
 from hjbjax.problem.sets import AdmissibleSet, AnyControl, Ball, Box, Finite, Simplex
 from hjbjax.problem.spaces import is_environment, is_space
 from hjbjax.problem.types import Control, Disturbance, Number, Numbers, State
+from hjbjax.problem.words import shown
 
 PAYMENTS = {  # the payments of a problem with rewards, and the same payments as costs
     "reward": "cost",
@@ -345,7 +346,7 @@ def _check_functions(drift: object, target: object) -> None:
             "a rate of change,\nand controls=hjb.from_gymnasium(env.action_space)"
         )
     if not callable(drift):
-        raise TypeError(f"Problem.drift: got {drift!r}, wanted a function (x, u) -> (n,)")
+        raise TypeError(f"Problem.drift: got {shown(drift)}, wanted a function (x, u) -> (n,)")
     if isinstance(target, (tuple, list, np.ndarray)):
         cure = "the union of several targets is lambda x: jnp.minimum(first(x), second(x))"
         if not any(map(callable, target)):
@@ -386,7 +387,9 @@ def _rate(discount: object) -> Any:
         return as_partial(discount, "Problem.discount")
     rate = numbers(discount, "Problem.discount")
     if np.ndim(rate) != 0 or (isinstance(rate, np.ndarray) and not 0 <= rate < np.inf):
-        raise ValueError(f"Problem.discount: got {discount!r}, wanted a finite number ≥ 0, or a function of the state")
+        raise ValueError(
+            f"Problem.discount: got {shown(discount)}, wanted a finite number ≥ 0, or a function of the state"
+        )
     return float(rate) if isinstance(rate, np.ndarray) else rate
 
 
@@ -396,10 +399,10 @@ def _noise(noise: object) -> Any:
     if sigma is None or callable(sigma) or is_traced(sigma):
         return sigma
     if not np.all(np.isfinite(sigma)):
-        raise ValueError(f"Problem.noise: got {noise!r}, wanted finite numbers")
+        raise ValueError(f"Problem.noise: got {shown(noise)}, wanted finite numbers")
     # entries of a matrix may be negative: their signs set the correlation of the noises
     if np.ndim(sigma) < 2 and np.any(np.asarray(sigma) < 0):
-        raise ValueError(f"Problem.noise: got {noise!r}, wanted numbers ≥ 0: it is σ in dx = f dt + σ dw")
+        raise ValueError(f"Problem.noise: got {shown(noise)}, wanted numbers ≥ 0: it is σ in dx = f dt + σ dw")
     return sigma
 
 
@@ -414,5 +417,5 @@ def _function_or_number(value: object, name: str, largest: int = 0) -> Any:
     if not isinstance(array, np.ndarray):
         return array
     if np.any(np.isnan(array)):  # infinity is allowed: "never stop here", "never enter"
-        raise ValueError(f"{name}: got {value!r}, which is not a number")
+        raise ValueError(f"{name}: got {shown(value)}, which is not a number")
     return array if array.ndim else float(array)

@@ -9,6 +9,7 @@ import numpy as np
 
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, Number
+from hjbjax.problem.words import shown
 
 
 @pytree_dataclass(static=("direction",))
@@ -69,10 +70,10 @@ def check_pushes(pushes: object) -> tuple[Push, ...]:
       ValueError: two pushes in the same direction, or directions of different lengths.
     """
     if isinstance(pushes, Push) or not isinstance(pushes, (list, tuple)):
-        raise TypeError(f"Problem.pushes: got {pushes!r}, wanted a list, as in [hjb.Push([-1.0], cost=1.0)]")
+        raise TypeError(f"Problem.pushes: got {shown(pushes)}, wanted a list, as in [hjb.Push([-1.0], cost=1.0)]")
     for push in pushes:
         if not isinstance(push, Push):
-            raise TypeError(f"Problem.pushes: got {push!r} in the list, wanted hjb.Push(direction, cost)")
+            raise TypeError(f"Problem.pushes: got {shown(push)} in the list, wanted hjb.Push(direction, cost)")
     directions = [push.direction for push in pushes]
     if len(set(directions)) < len(directions) or len(set(map(len, directions))) > 1:
         raise ValueError(
@@ -102,8 +103,8 @@ def _axis_direction(direction: Sequence[float]) -> tuple[int, ...]:
     entries = np.asarray(direction, float)
     if entries.ndim != 1 or np.count_nonzero(entries) != 1 or abs(entries.sum()) != 1:
         raise ValueError(
-            f"Push.direction: got {direction!r}, wanted one entry 1 or -1 and zeros: a push leads to the next node "
-            "along an axis.\nFor another direction, change to coordinates in which it is an axis"
+            f"Push.direction: got {shown(direction)}, wanted one entry 1 or -1 and zeros: a push leads to the next "
+            "node along an axis.\nFor another direction, change to coordinates in which it is an axis"
         )
     return tuple(int(entry) for entry in entries)
 
@@ -118,5 +119,5 @@ def _marginal(paid: Any, name: str, forbidden: float) -> Any:
     if not isinstance(number, np.ndarray):
         return number
     if np.isnan(number) or number == forbidden:
-        raise ValueError(f"{name}: got {paid!r}, wanted a number; infinity only as a cost, which forbids the push")
+        raise ValueError(f"{name}: got {shown(paid)}, wanted a number; infinity only as a cost, which forbids the push")
     return float(number)

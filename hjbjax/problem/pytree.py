@@ -8,7 +8,6 @@ would fail on tracers and stacked arrays.
 
 import copy
 import dataclasses
-import difflib
 import functools
 import hashlib
 import inspect
@@ -21,7 +20,7 @@ import numpy as np
 
 from hjbjax.problem.settings import own_settings, refuse_error_checks
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.problem.words import ELSEWHERE, WAYS
+from hjbjax.problem.words import cure_of, missing, shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -76,6 +75,23 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
             return self
 
         jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
+        return cls
+
+    return register
+
+
+def with_ways_out(table: dict[str, str]) -> Callable[[type[T]], type[T]]:
+    """Class decorator: an attribute that does not exist is refused with the advice for its name in a table of words."""
+
+    def register(cls: type[T]) -> type[T]:
+        def find(self: Any, name: str) -> Any:
+            if name.startswith("__") or hasattr(cls, name):
+                return object.__getattribute__(self, name)  # raises again what a property raised
+            message = missing(f"{cls.__name__!r} object", name, table)
+            # from ``obj`` Python derives a suggestion of its own
+            raise AttributeError(message, name=name, obj=None if name.lower() in table else self)
+
+        cls.__getattr__ = find  # type: ignore[attr-defined]  # not a method, which would hide misspelt names from mypy
         return cls
 
     return register
@@ -139,15 +155,7 @@ def refuse_misspelt(words: Iterable[str], by_name: Set[str], function: str) -> N
     for word in words:
         if word in by_name:
             continue
-        # running_cost means cost, although its spelling is closer to running_max
-        parts = [part for part in word.split("_")[::-1] if part in by_name]
-        elsewhere = [own for own in ELSEWHERE.get(word.lower(), ()) if own in by_name]
-        near = parts or elsewhere or difflib.get_close_matches(word, by_name)
-        cure = f"did you mean {near[0]}?" if near else f"wanted one of {', '.join(sorted(by_name - {'self'}))}"
-        own, way = WAYS.get(word.lower(), (None, ""))  # the keyword that belongs to the word, if only functions with it
-        if way and (own in by_name or (own is None and not elsewhere)):
-            cure = way
-        raise TypeError(f"{function}() got an unexpected keyword argument {word!r}: {cure}")
+        raise TypeError(f"{function}() got an unexpected keyword argument {word!r}: {cure_of(word, by_name)}")
 
 
 def _compare_by_value(cls: type, names: tuple[str, ...]) -> None:
@@ -301,7 +309,7 @@ def numbers(value: object, name: str) -> Any:
     except OverflowError:  # an integer beyond 1e308
         raise ValueError(f"{name}: got {value!r:.60}, wanted numbers that fit into float64") from None
     except (TypeError, ValueError):
-        raise TypeError(f"{name}: got {value!r}, wanted numbers") from None
+        raise TypeError(f"{name}: got {shown(value)}, wanted numbers") from None
 
 
 def as_partial(function: Callable | None, name: str = "function") -> jax.tree_util.Partial | None:
@@ -312,7 +320,7 @@ def as_partial(function: Callable | None, name: str = "function") -> jax.tree_ut
     if function is None or isinstance(function, jax.tree_util.Partial):
         return function
     if not callable(function):
-        raise TypeError(f"{name}: got {function!r}, wanted a function of one state")
+        raise TypeError(f"{name}: got {shown(function)}, wanted a function of one state")
     # the function of a Partial belongs to the structure, so use the function of the class, which is equal for all
     # objects, and pass the object as an argument; a bound method would recompile for every object
     if not jax.tree_util.all_leaves([function]):

@@ -15,6 +15,7 @@ import numpy as np
 
 from hjbjax.problem.pytree import is_traced, known, numbers, pytree_dataclass
 from hjbjax.problem.types import Array, DType, Number
+from hjbjax.problem.words import shown
 
 SPREAD = 4.0  # samples of an unbounded input are sinh(4 s), 0 ≤ s ≤ 1: up to 27 beyond its finite bound, or zero
 SLACK = 1e-6  # relative to the size of a set: eight roundings of float32, in which a control may have been computed
@@ -24,7 +25,7 @@ def _finite_numbers(value: object, name: str) -> Array:
     """Numbers as an array; refused if not finite, because H may be −∞ everywhere over an unbounded set."""
     array = numbers(value, name)
     if isinstance(array, np.ndarray) and not np.all(np.isfinite(array)):
-        raise ValueError(f"{name}: got {value!r}, wanted finite numbers: bound the set")
+        raise ValueError(f"{name}: got {shown(value)}, wanted finite numbers: bound the set")
     return array
 
 
@@ -32,7 +33,7 @@ def _bounds(value: object, name: str, infinite: float) -> Array:
     """Bounds as an array; refused if NaN, or infinite with the sign that leaves nothing."""
     array = numbers(value, name)
     if isinstance(array, np.ndarray) and np.any(np.isnan(array) | (np.isinf(array) & (array != infinite))):
-        raise ValueError(f"{name}: got {value!r}, wanted finite numbers, or {infinite:g} where there is no bound")
+        raise ValueError(f"{name}: got {shown(value)}, wanted finite numbers, or {infinite:g} where there is no bound")
     return array
 
 

@@ -176,10 +176,11 @@ def nearest(grid: Grid, values: Array, x: jax.Array, clamp: bool, when: Moment |
     """The values at the nearest node of the cell where no entry is NaN; on ties the lower node."""
     answer: Any = jnp.nan
     largest: Any = 0.0
+    # At a midpoint rounding must not decide. There an error e of a position changes the quotient of two weights by 4 e.
+    ties = jnp.minimum(sum(4 * grid.slack(axis, x.dtype) for axis in range(grid.ndim)), 0.5)
     for weight, defined, there in _defined_corners(grid, values, x, clamp, when):
-        # A node is nearer along every axis if and only if its weight is larger; at the midpoint rounding must not
-        # decide.
-        nearer = defined & (weight > largest * (1 + 8 * jnp.finfo(x.dtype).eps))
+        # a node is nearer along every axis if and only if its weight is larger
+        nearer = defined & (weight > largest * (1 + ties))
         answer, largest = jnp.where(nearer[..., None], there, answer), jnp.where(nearer, weight, largest)
     return answer
 

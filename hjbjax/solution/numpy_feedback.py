@@ -35,7 +35,9 @@ on a periodic axis is node 0. Round a place to the nearest integer if it differs
 (3) Each of the 2^n corners b ∈ {0, 1}^n has the weight w_b = Π_i (f_i if b_i else 1 − f_i). After ``march`` the time is
 one more axis before the others. (4) The value is Σ w_b V_b over the corners with w_b > 0. The control is the same mean
 over the corners where the control is not NaN, divided by their total weight. An enumerated control and ``switching``
-are not averaged: the corner with the largest weight decides, on ties the first one.
+are not averaged: the corner with the largest weight decides, on ties the first one. Weights are tied if they differ by
+less than a fraction of 32 ε Σ_i M_i max(1, |lo_i|/(hi_i − lo_i), |hi_i|/(hi_i − lo_i)), at most ½, with the machine
+epsilon ε of the type of ``value``.
 """
 
 import itertools
@@ -67,6 +69,9 @@ class Feedback:
         self._top = np.where(hi > lo, self._scale, 0.0)  # the place of the last node; 0 if only one time is stored
         size = np.maximum(np.abs(lo), np.abs(hi)) / self._span
         self._slack = np.where(uniform, 8 * EPS * self._last * np.maximum(1, size), 64 * EPS * np.maximum(1, size))
+        # at a midpoint an error e of a place changes the quotient of two weights by 4 e
+        rounding = 32 * np.finfo(arrays["value"].dtype).eps * self._last * np.maximum(1, size)
+        self._ties = min(float(rounding[len(lead) :].sum()), 0.5)
         self._wraps = bool(periodic.any())
         self._uneven = [axis for axis in range(len(lo)) if not uniform[axis]]
         self._corner = np.array(list(itertools.product((0, 1), repeat=len(lo))))
@@ -100,7 +105,7 @@ class Feedback:
         """
         weights, nodes, hidden = self._corners(where, mode, clamp)
         found = self._at("switching", nodes)[..., 0]
-        return np.where(hidden, -1, np.take_along_axis(found, _nearest(weights), axis=-1)[..., 0])[()]
+        return np.where(hidden, -1, np.take_along_axis(found, self._nearest(weights), axis=-1)[..., 0])[()]
 
     def _player(self, name: str, number: int, where: tuple, mode: "str | int | None", clamp: bool) -> np.ndarray:
         """The actions of one player between the nodes."""
@@ -109,7 +114,7 @@ class Feedback:
         defined = ~np.isnan(found).any(axis=-1)
         weights = np.where(defined & ~hidden[..., None], weights, 0)
         if self._arrays["enumerated"][number]:
-            answer = np.take_along_axis(found, _nearest(weights)[..., None], axis=-2)[..., 0, :]
+            answer = np.take_along_axis(found, self._nearest(weights)[..., None], axis=-2)[..., 0, :]
             return np.where(weights.any(axis=-1, keepdims=True), answer, np.nan)
         total = weights.sum(axis=-1, keepdims=True)
         answer = (weights[..., None] * np.where(defined[..., None], found, 0)).sum(axis=-2)
@@ -169,6 +174,11 @@ class Feedback:
             x = np.where(beyond, np.where(moved >= self._hi, self._lo, moved), x)
         return x
 
+    def _nearest(self, weights: np.ndarray) -> np.ndarray:
+        """The first corner with the largest weight, shape (..., 1); at a midpoint rounding must not decide."""
+        largest = weights.max(axis=-1, keepdims=True)
+        return np.argmax(weights * (1 + self._ties) >= largest, axis=-1)[..., None]
+
     def _search(self, nodes: np.ndarray, x: np.ndarray) -> "tuple[np.ndarray, np.ndarray]":
         """The node below x and the fraction of the distance to the next node, on an axis with unequal spacings."""
         cell = np.maximum(np.minimum(np.searchsorted(nodes, x, side="right") - 1, len(nodes) - 2), 0)
@@ -192,9 +202,3 @@ def load(path: Any) -> Feedback:
             found = f"{header['format']}, version {header['version']}"
             raise ValueError(f"{path}: got {found}; wanted {FORMAT} up to version {VERSION}, from Solution.export")
         return Feedback(header, {name: file[name] for name in header["arrays"]})
-
-
-def _nearest(weights: np.ndarray) -> np.ndarray:
-    """The first corner with the largest weight, shape (..., 1); at a midpoint rounding must not decide."""
-    largest = weights.max(axis=-1, keepdims=True)
-    return np.argmax(weights * (1 + 8 * EPS) >= largest, axis=-1)[..., None]

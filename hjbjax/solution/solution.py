@@ -20,9 +20,10 @@ from hjbjax.problem import settings
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST, Labels
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced, pytree_dataclass
+from hjbjax.problem.pytree import is_traced, pytree_dataclass, with_ways_out
 from hjbjax.problem.sets import Finite
 from hjbjax.problem.types import Array, Numbers
+from hjbjax.problem.words import OF_SOLUTION
 from hjbjax.solution import archive, files, screen
 from hjbjax.solution.files import FileError
 from hjbjax.solution.free_boundary import boundary_of
@@ -56,6 +57,7 @@ class SolveError(RuntimeError):
         self.solution, self.solutions = solution, tuple(solutions)
 
 
+@with_ways_out(OF_SOLUTION)
 @pytree_dataclass(
     static=("discrete", "discrete_disturbance", "labels"), host=("residuals", "stats", "message", "problem")
 )
@@ -366,8 +368,15 @@ class Solution:
           ``(control, state)``, the control of shape ``x.shape[:-1] + (m,)``; NaN where undefined, as in the target.
 
         Raises:
-          ValueError: a marched solution, whose control depends on time; use ``control_at(t, x)``.
+          ValueError: a marched solution, whose control depends on time; use ``control_at(t, x)``. An observation that
+            is not a state, such as the cosine and sine of an angle.
         """
+        if self.times is None and np.ndim(observation) and np.shape(observation)[-1] != self.grid.ndim:
+            raise ValueError(
+                f"Solution.predict: got states of shape {np.shape(observation)}, wanted (..., {self.grid.ndim}): "
+                f"{', '.join(self.grid.names)}.\nIf the observation is not the state, compute the state from it, for "
+                "example an angle as numpy.arctan2(sine, cosine)"
+            )
         if settings.are_usual() and (isinstance(observation, np.ndarray) or not is_traced(observation)):
             x, lookup = np.asarray(observation), self._lookup
             if lookup is not None and x.dtype.kind in "fiu" and x.shape[-1:] == (self.grid.ndim,):

@@ -32,12 +32,13 @@ from hjbjax.hamiltonian import exact
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.problem import arguments
-from hjbjax.problem.arguments import as_mesh, shown
+from hjbjax.problem.arguments import as_mesh
 from hjbjax.problem.grid import Grid, check_spacings
 from hjbjax.problem.layouts import Lanes, spans_processes
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import DType, Nodes
+from hjbjax.problem.words import shown
 from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint, File
 from hjbjax.solution.clock import CUT, Clock, Stopped, noting_interrupts

@@ -11,6 +11,9 @@ under the names that the command line uses.
     (1, (81,), ())
 """
 
+from typing import TYPE_CHECKING, NoReturn
+
+from hjbjax.problem import words
 from hjbjax.zoo.constrained_firm import ConstrainedFirm, Refinancing, liquidation, refinancing
 from hjbjax.zoo.dividends import Reserve, dividends, dividends_exact
 from hjbjax.zoo.entry import Entry
@@ -352,3 +355,9 @@ __all__ = [
     "zermelo",
     "zermelo_exact",
 ]
+
+if not TYPE_CHECKING:  # otherwise type checkers would accept any name
+
+    def __getattr__(name: str) -> NoReturn:
+        """Refuse a name that does not exist, with the way out; Python calls this function for no other name."""
+        raise AttributeError(words.missing(f"module {__name__!r}", name, words.OF_ZOO, __all__), name=name)

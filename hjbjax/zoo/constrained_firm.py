@@ -177,7 +177,8 @@ def liquidation(
     firm = ConstrainedFirm(interest, depreciation, productivity, volatility, adjustment, carrying, liquidation)
     problem = Problem(
         firm.drift, controls=firm.investments, noise=volatility, discount=interest, growth=firm.growth,
-        target=firm.cash, exit_reward=liquidation, pushes=[Push([-1.0], reward=1.0)], control_names=("investment",),
+        target=firm.cash, exit_reward=liquidation, pushes=[Push([-1.0], reward=1.0)],
+        control_names=("investment",), control_units=("1/year",),
     )  # fmt: skip
     return problem, Grid([0.0], [MOST_CASH], shape, names=("cash",))
 
@@ -221,6 +222,7 @@ def refinancing(
         issues.drift, reward=issues.reward, controls=firm.investments, noise=volatility, discount=interest,
         growth=issues.growth, stopping_reward=issues.liquidated,
         modes=Modes(("operating", "issuing"), switching_cost=costs),
-        pushes=[Push([-1.0], reward=issues.payout), Push([1.0], issues.issue)], control_names=("investment",),
+        pushes=[Push([-1.0], reward=issues.payout), Push([1.0], issues.issue)],
+        control_names=("investment",), control_units=("1/year",),
     )  # fmt: skip
     return problem, Grid([0.0], [MOST_CASH], shape, names=("cash",))

@@ -141,6 +141,7 @@ def merton(
         # the value of continuing on the whole line, known from the closed form
         exit_cost=system.value,
         control_names=("share at risk", "consumption"),
+        control_units=("", "1/year"),
     )
     return problem, Grid([-1.0], [1.0], shape, names=("log wealth",))
 
@@ -245,6 +246,7 @@ def merton_wealth(
         target=wealth.outside,
         exit_reward=wealth.value,
         control_names=("share at risk", "consumption"),
+        control_units=("", "1/year"),
     )
     return problem, Grid([0.5], [2.0], shape, names=("wealth",))
 

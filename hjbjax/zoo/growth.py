@@ -90,7 +90,12 @@ def growth(
     rest, rate = system.steady_state, system.consumption
     consumed = Box([rate * rest * LO / ROOM], [rate * rest * HI * ROOM])
     problem = Problem(
-        system.drift, controls=consumed, reward=system.reward, discount=discount, control_names=("consumption",)
+        system.drift,
+        controls=consumed,
+        reward=system.reward,
+        discount=discount,
+        control_names=("consumption",),
+        control_units=("1/year",),
     )
     # the optimal capital moves towards the steady state, so the constraint is not active
     return problem, Grid([LO * rest], [HI * rest], shape, names=("capital",), edges="constrained")

@@ -79,7 +79,7 @@ def thermostat(
     system = Thermostat(leak, outside, heating, wanted, fuel)
     modes = Modes(("off", "on"), switching_cost=two_modes(wear, wear))
     problem = Problem(system.drift, system.cost, noise=noise, discount=discount, modes=modes)
-    return problem, Grid([10.0], [30.0], shape, names=("temperature",))
+    return problem, Grid([10.0], [30.0], shape, names=("temperature",), units=("°C",))
 
 
 @pytree_dataclass()
@@ -148,5 +148,6 @@ def saving(
         discount=discount,
         modes=Modes(("poor", "rich"), rates=two_modes(*rates)),
         control_names=("consumption",),
+        control_units=("1/year",),
     )
     return problem, Grid([limit], [most], shape, names=("wealth",), edges="constrained")

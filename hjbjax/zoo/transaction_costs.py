@@ -123,5 +123,6 @@ def transaction_costs(
         discount=discount,
         pushes=[Push([1.0], investor.purchase), Push([-1.0], investor.sale)],
         control_names=("consumption",),
+        control_units=("1/year",),
     )
     return problem, Grid([0.0], [1.0], shape, names=("share",))

@@ -10,6 +10,8 @@ from scipy.sparse.linalg import spsolve
 
 import hjbjax as hjb
 from hjbjax.applications import root_search
+from hjbjax.applications.equilibrium import _shared_out
+from hjbjax.solvers.nested_grids import resized
 
 LINE = hjb.Grid([-3.0], [5.0], (41,))
 
@@ -181,6 +183,44 @@ def test_huggetts_economy_with_two_incomes(low, find, lose):
     assert found.law[1, 0] < found.law[0, 0]
     assert found.price == pytest.approx(brentq(bonds_of_workers, -0.01, 0.045, (low, find, lose), xtol=1e-10), abs=1e-6)
     assert len(found.tried) <= 12
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:equilibrium. the grid is coarse")
+def test_the_error_of_the_grid_is_estimated():
+    """The interest on many nodes is close to the exact one; the chain is of first order, so the error is large."""
+    found = {}
+    for count in (56, 111, 881):
+        ladder = hjb.Grid([-0.5], [5.0], (count,), edges="constrained")
+        rungs = np.asarray(ladder.axis(0))
+        found[count] = hjb.equilibrium(worker, ladder, lambda r, _, law, x=rungs: np.sum(law * x), (-0.01, 0.0498))
+    exact = found[881].price + found[881].grid_error
+    for count in (56, 111):
+        error = abs(found[count].price - exact)
+        assert 0.4 * error < found[count].grid_error < 1.5 * error
+    assert f"grid error about {found[56].grid_error:.2g}" in repr(found[56])
+
+
+@pytest.mark.parametrize(
+    ("fine", "coarse"),
+    [
+        (hjb.Grid([-1.0], [2.0], (7,)), (4,)),
+        (hjb.Grid([-1.0, 0.0], [2.0, 1.0], (9, 8), stretch=(hjb.Sinh(2.0), None)), (5, 4)),
+    ],
+)
+def test_a_law_of_a_coarse_grid_keeps_its_means(fine, coarse):
+    rough = resized(fine, coarse)
+    law = np.random.default_rng(1).random(coarse)
+    moved = _shared_out(law, rough, fine)
+    assert moved.shape == fine.shape
+    assert moved.min() >= 0
+    for f in (lambda x: 1.0 + 0 * x[..., 0], lambda x: x[..., 0], lambda x: x[..., -1]):
+        np.testing.assert_allclose(np.sum(moved * f(fine.nodes())), np.sum(law * f(rough.nodes())), rtol=1e-12)
+
+
+def test_a_law_on_a_circle_is_shared_out_across_the_seam():
+    fine, rough = (hjb.Grid([0.0], [1.0], (count,), periodic=(True,)) for count in (4, 3))
+    np.testing.assert_allclose(_shared_out(np.array([0.0, 0.0, 1.0]), rough, fine), [0, 0, 1 / 3, 2 / 3], atol=1e-15)
 
 
 # --- derivatives ---

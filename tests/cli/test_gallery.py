@@ -3,6 +3,7 @@
 import base64
 import os
 import re
+import types
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from click.testing import CliRunner
 
 import hjbjax
 from hjbjax import zoo
-from hjbjax.cli import gallery
+from hjbjax.cli import gallery, run_folder
 from hjbjax.cli.gallery import Card, card, page, small_shape
 from hjbjax.cli.main import main
 from hjbjax.solution.solution import Solution, Status
@@ -166,3 +167,24 @@ def test_a_refusal_is_a_card_and_an_interrupt_none(monkeypatch):
     monkeypatch.setattr(hjbjax, "solve", solved(lambda x: x[..., 0], Status.INTERRUPTED))
     with pytest.raises(KeyboardInterrupt):
         card(zoo.catalogue["smooth"])
+
+
+def test_a_control_that_jumps_is_held_while_the_path_crosses_a_cell():
+    grid = hjbjax.Grid([0.0, 0.0], [1.0, 8.0], (11, 9))
+    times = np.linspace(0.0, 10.0, 101)
+    path = types.SimpleNamespace(times=times, states=np.stack([0.02 * times, 2.5 * times], axis=-1))
+    assert run_folder.crossing_time(path, grid, 20.0) == pytest.approx(0.4)  # a unit at the speed 2.5
+    assert run_folder.crossing_time(path, grid, 2.0) == 2.0 / run_folder.FEWEST
+    still = types.SimpleNamespace(times=times, states=np.zeros((101, 2)))
+    assert run_folder.crossing_time(still, grid, 10.0) == 10.0 / run_folder.SAMPLES
+
+
+@pytest.mark.slow
+def test_the_double_integrator_switches_once():
+    """Exactly: full force, then full force the other way; V = 1 − exp(−2) for a time of 2 from rest at 1."""
+    entry = zoo.catalogue["double-integrator"]
+    problem, grid = entry.build(shape=(101, 101))
+    solution = hjbjax.solve(problem, grid, scheme=hjbjax.SemiLagrangian())
+    path = run_folder.closed_path(problem, solution, entry.start, entry.duration, True, None)
+    assert np.count_nonzero(np.diff(path.controls[:, 0])) == 1
+    assert float(path.cost) == pytest.approx(1 - np.exp(-2.0), abs=1e-3)

@@ -348,6 +348,34 @@ def test_the_switching_curve_lies_where_the_control_changes_sign():
     assert distance.max() < 2 * 0.05  # in x1 the curve moves at most 3 per unit of x2; cells are .05 wide
 
 
+@pytest.mark.parametrize("slope", [0.3, 1.0, 2.3])
+def test_the_switching_curve_of_a_feedback_that_jumps_is_no_staircase(slope):
+    grid = Grid([-1.0, -1.0], [1.0, 1.0], (41, 41))
+    jump = made(grid, lambda x: x[..., 0], lambda x: np.where(x[..., 1:] > slope * x[..., :1] + 0.013, 1.0, -1.0))
+    curve = plotting.switching_curve(jump)[0].get_paths()[0].vertices
+    inner = curve[np.abs(curve).max(axis=1) < 0.8]
+    off = (inner[:, 1] - slope * inner[:, 0] - 0.013) / np.hypot(1, slope)
+    assert np.abs(off).max() < 0.025  # half a cell
+    length = np.linalg.norm(np.diff(inner, axis=0), axis=1).sum()
+    assert length < 1.005 * np.linalg.norm(inner[-1] - inner[0])  # a staircase is longer than the line
+
+
+def test_no_control_is_drawn_where_the_state_stops():
+    grid = Grid([-2.0], [2.0], (41,))
+    x = grid.axis(0)
+    policy = np.where(x < -1.9, 50.0, x)[:, None]  # any number in the stopping set
+    solution = Solution(grid, np.maximum(np.abs(x) - 1, 0.0) ** 2, policy, stopping=np.abs(x) >= 1)
+    picture = plotting.policy(solution)
+    drawn = np.ma.masked_invalid(picture[0].get_ydata()).compressed()
+    np.testing.assert_allclose(drawn, x[np.abs(x) < 1])
+    assert picture.ax.get_ylim()[1] < 2
+    plane = Grid([-2.0, -1.0], [2.0, 1.0], (41, 11))
+    both = np.broadcast_to(policy[:, None], (*plane.shape, 1))
+    stopping = np.abs(plane.nodes()[..., 0]) >= 1
+    solution = Solution(plane, np.where(stopping, 0.0, 1.0), both, stopping=stopping)
+    assert np.abs(plotting.policy(solution)[0].get_clim()).max() < 1
+
+
 def test_switching_points_over_one_axis():
     assert [line.get_xdata()[0] for line in plotting.switching_curve(line(), label=None)] == [0.0]  # a node
     shifted = made(line().grid, lambda x: x[..., 0], lambda x: 0.2 - x)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
-from hjbjax.problem import arguments
+from hjbjax.problem import arguments, words
 
 NO_NUMBERS = [0, 0.0, -1, -1e-300, float("nan"), float("inf"), True, np.True_, None, "1", [1.0], np.ones(1), 10**400]
 NO_COUNTS = [0, -1, 2.0, float("nan"), float("inf"), True, np.True_, None, "7", [3], np.float64(3)]
@@ -94,6 +94,6 @@ def test_an_endless_limit_is_one():
 
 
 def test_long_values_are_cut():
-    assert len(arguments.shown(list(range(10**4)))) <= arguments.SHOWN
-    assert arguments.shown("two\nlines") == "'two\\nlines'"
-    assert "\n" not in arguments.shown(np.eye(9))
+    assert len(words.shown(list(range(10**4)))) <= words.SHOWN
+    assert words.shown("two\nlines") == "'two\\nlines'"
+    assert "\n" not in words.shown(np.eye(9))

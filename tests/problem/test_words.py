@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 import hjbjax as hjb
+from hjbjax.feedback.path import Path
+from hjbjax.problem import words
+from hjbjax.problem.pytree import pytree_dataclass, with_ways_out
 
 
 class Space:
@@ -36,6 +39,7 @@ def first(x):
 U, G = hjb.Box([-1.0], [1.0]), hjb.Grid([-1, -1], [1, 1], (5, 5))
 P = hjb.Problem(f, cost, U, discount=1.0)
 S = hjb.Solution(G, np.zeros(G.shape), np.zeros((*G.shape, 1)))
+PATH = Path(np.zeros(2), np.zeros((2, 2)), np.zeros((1, 1)), None, 0.0, None, 0, 1)
 RATE = r"discount=hjb\.discount_rate\(gamma, dt\)"
 REFUSED = {
     "gamma=": (lambda: hjb.Problem(f, cost, U, gamma=0.99), RATE),
@@ -79,6 +83,54 @@ REFUSED = {
     "Grid(dx=)": (lambda: hjb.Grid([-1], [1], dx=0.1), "wanted the number of nodes per axis"),
     "Grid(boundary=)": (lambda: hjb.Grid([-1], [1], (5,), boundary="open"), "wanted edges=: 'projected'"),
     "Grid(periodic=True)": (lambda: hjb.Grid([-1], [1], (5,), periodic=True), "one bool per axis"),
+    "control_space=": (lambda: hjb.Problem(f, cost, control_space=U), r"controls=hjb\.Box\(lo, hi\)"),
+    "disturbance_space=": (lambda: hjb.Problem(f, cost, U, disturbance_space=U), r"disturbances=hjb\.Box"),
+    "control_mode=": (lambda: hjb.Problem(f, cost, U, control_mode="max"), r"hjb\.avoid is 'max', 'min'"),
+    "uMode=": (lambda: hjb.reach(f, U, first, uMode="max"), "the control minimises"),
+    "Q=": (lambda: hjb.Problem(f, Q=np.eye(2)), r"cost=lambda x, u: x @ Q @ x \+ u @ R @ u"),
+    "reach(obstacle=)": (lambda: hjb.reach(f, U, first, obstacle=first), r"hjb\.reach_avoid\(drift, controls, target"),
+    "reach(array)": (lambda: hjb.reach(f, U, np.zeros((31, 31))), r"\.\.\., wanted a function of one state"),
+    "solve(epsilon=)": (lambda: hjb.solve(P, G, epsilon=1e-3), r"did you mean tol\?"),
+    "solve(verbose=)": (lambda: hjb.solve(P, G, verbose=True), r"did you mean progress\?"),
+    "solve(cost=)": (lambda: hjb.solve(P, G, terminal_cost=first), r"belongs to the problem: hjb\.Problem"),
+    "simulate(dt=)": (lambda: hjb.simulate(P, S, [0, 0], 1.0, dt=0.1), "hold=dt holds the control"),
+    "simulate(seed=)": (lambda: hjb.simulate(P, S, [0, 0], 1.0, seed=0), r"did you mean key\?"),
+    "value(save=)": (lambda: hjb.plotting.value(S, save="v.png"), r"has \.save\(path\)"),
+    "value(figsize=)": (lambda: hjb.plotting.value(S, figsize=(6, 4)), "draw on axes of your own figure"),
+    "predict(observation)": (
+        lambda: S.predict([1.0, 0.0, 0.5]),
+        r"wanted \(\.\.\., 2\): x1, x2\.\nIf the observation is not",
+    ),
+}
+MISSING = {
+    "hjb.lqr": (lambda: hjb.lqr, r"scipy\.linalg\.solve_continuous_are"),
+    "hjb.StateSpace": (lambda: hjb.StateSpace, "write the rate of change of the state as a function"),
+    "hjb.MPC": (lambda: hjb.MPC, r"hjb\.pontryagin\(problem, x0\)"),
+    "hjb.value_iteration": (lambda: hjb.value_iteration, r"method=hjb\.ValueIteration\(\)"),
+    "hjb.DiscreteDP": (lambda: hjb.DiscreteDP, r"hjb\.chain\.transition_arrays"),
+    "hjb.MarkovChain": (lambda: hjb.MarkovChain, r"hjb\.chain\.stationary_law"),
+    "hjb.tauchen": (lambda: hjb.tauchen, r"hjb\.Modes\(names, rates=\.\.\.\)"),
+    "hjb.step": (lambda: hjb.step, r"hjb\.march\(hjb\.reach"),
+    "hjb.sets": (lambda: hjb.sets.Box, r"hjb\.Box\(lo, hi\)"),
+    "hjb.rollout": (lambda: hjb.rollout, r"hjb\.simulate\(problem, solution, x0, duration\)"),
+    "hjb.train": (lambda: hjb.train, "does not learn from samples"),
+    "hjb.plot": (lambda: hjb.plot, r"hjb\.plotting\.value\(solution\)"),
+    "zoo.cart_pole": (lambda: hjb.zoo.cart_pole, "'From Gymnasium'"),
+    "zoo.lqr": (lambda: hjb.zoo.lqr, r"did you mean double_integrator_lq, "),
+    "zoo.huggett": (lambda: hjb.zoo.huggett, r"did you mean saving\?"),
+    "zoo.pendulm": (lambda: hjb.zoo.pendulm, r"did you mean pendulum\?"),
+    "plotting.contour": (lambda: hjb.plotting.contour, r"did you mean value\?"),
+    "plotting.trajectry": (lambda: hjb.plotting.trajectry, r"did you mean trajectory\?"),
+    "solution.V": (lambda: S.V, r"\.value_at\(x\)"),
+    "solution.sigma": (lambda: S.sigma, r"\.control_at\(x\)"),
+    "solution.grad": (lambda: S.grad, r"\.costate_at\(x\)"),
+    "solution.success": (lambda: S.success, r"hjb\.Status\.CONVERGED"),
+    "solution.act": (lambda: S.act, r"\.predict\(x\)"),
+    "solution.plot()": (lambda: S.plot(), r"hjb\.plotting\.value\(solution\)"),
+    "grid.states": (lambda: G.states, r"\.nodes\(\)"),
+    "grid.coordinate_vectors": (lambda: G.coordinate_vectors, r"\.axis\(i\)"),
+    "Path.y": (lambda: PATH.y, r"\.states"),
+    "Path.inputs": (lambda: PATH.inputs, r"\.controls"),
 }
 SUPPORTED = {
     "reward=": lambda: hjb.Problem(f, reward=cost, controls=U).payoff == "reward",
@@ -99,6 +151,46 @@ def test_a_word_is_answered_with_the_way_out(word):
     with pytest.raises((TypeError, ValueError), match=way) as caught:
         call()
     assert len(str(caught.value).splitlines()) <= 6
+
+
+@pytest.mark.parametrize("word", MISSING)
+def test_a_name_that_does_not_exist_is_answered_with_the_way_out(word):
+    call, way = MISSING[word]
+    with pytest.raises(AttributeError, match=f"has no attribute .*{way}"):
+        call()
+
+
+def test_no_word_hides_a_name_that_exists():
+    for owner, table in (
+        (hjb, words.OF_PACKAGE),
+        (hjb.zoo, words.OF_ZOO),
+        (hjb.plotting, words.OF_PLOTTING),
+        (S, words.OF_SOLUTION),
+        (G, words.OF_GRID),
+        (PATH, words.OF_PATH),
+    ):
+        assert not [name for name in dir(owner) if name in table and not name.startswith("_")], owner
+
+
+def test_names_without_advice_raise_as_usual():
+    assert not hasattr(S, "__jax_array__")
+    with pytest.raises(AttributeError, match=r"^'Solution' object has no attribute 'valeu'$") as caught:
+        S.valeu  # noqa: B018
+    assert (caught.value.name, caught.value.obj) == ("valeu", S)  # of which Python makes "did you mean 'value'?"
+
+
+def test_an_error_inside_a_property_is_not_hidden():
+    @with_ways_out({"cost": "somewhere else"})
+    @pytree_dataclass()
+    class Broken:
+        x: float
+
+        @property
+        def cost(self):
+            return self.x.nothing
+
+    with pytest.raises(AttributeError, match="'float' object has no attribute 'nothing'"):
+        Broken(1.0).cost  # noqa: B018
 
 
 @pytest.mark.parametrize("word", SUPPORTED)

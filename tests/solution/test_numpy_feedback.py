@@ -1,5 +1,6 @@
 """The exported feedback: the same answers with NumPy only, from a copy of one file."""
 
+import dataclasses
 import shutil
 import subprocess
 import sys
@@ -81,6 +82,21 @@ def test_the_answers_are_the_same(name, tmp_path):
         one = found(*(each[20] for each in where), clamp=clamp)  # a single state
         np.testing.assert_array_equal(one, answer[20])
     assert np.isfinite(answer[:, 0]).sum() > 30
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("grid", [PLAIN, hjb.Grid([-2.0, -2.0], [2.0, 2.0], (21, 21)), GRID])
+def test_between_equally_near_nodes_the_lower_one_decides(grid, dtype, tmp_path):
+    """Midpoints along both axes: the coordinates are rounded, so the four weights differ in their last digits."""
+    case = solution(grid, dtype=dtype, discrete=True)
+    index = np.arange(int(np.prod(grid.shape)), dtype=dtype).reshape(*grid.shape, 1)
+    case = dataclasses.replace(case, policy=index)
+    lower = np.stack(np.meshgrid(*(np.arange(n - 1) for n in grid.shape), indexing="ij"), axis=-1).reshape(-1, 2)
+    axes = [np.asarray(grid.axis(i)) for i in range(2)]
+    x = np.stack([(a[k] + a[k + 1]) / 2 for a, k in zip(axes, lower.T, strict=True)], axis=-1)
+    wanted = index[tuple(lower.T)]
+    np.testing.assert_array_equal(case.control_at(x), wanted)
+    np.testing.assert_array_equal(exported(case, tmp_path).control(x), wanted)
 
 
 def test_a_mode_is_named_or_numbered(tmp_path):

@@ -165,7 +165,7 @@ class _Separation(Algebra):
     def constant(self, value: Numbers, index: tuple[int, ...]) -> Separated:
         if not isinstance(value, jax.core.Tracer):  # a trace would make the entry of a JAX array a tracer
             value = np.asarray(value)
-        return Separated(ONE, {NONE: value[index]})  # type: ignore[index]
+        return Separated(ONE, {NONE: value[index]})
 
     def entrywise(
         self, primitive: jex.Primitive, params: dict, operands: list[Separated], dtypes: Sequence[np.dtype]

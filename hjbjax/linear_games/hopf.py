@@ -353,7 +353,7 @@ def _evaluate_traced(solution: HopfSolution, name: str, t: Numbers, x: Numbers |
     n, x = solution.game.terminal.dim, jnp.asarray(x)
     x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
     _check_states(name, n, x.shape)
-    t = jnp.asarray(t, x.dtype)
+    solution, t = cast(solution, x.dtype), jnp.asarray(t, x.dtype)
     if t.ndim:  # every state has its own tables of the dynamics
         t, x = jnp.broadcast_to(t, x.shape[:-1]).reshape(-1, 1), x.reshape(*x.shape[:-1], n)
         each = jax.vmap(lambda t, x: _lanes(solution, t[0], x[None]))(t, x.reshape(-1, n))

@@ -168,6 +168,15 @@ def test_the_derivative_is_the_costate_and_follows_parameters():
 
 
 @pytest.mark.slow
+def test_float32_states_have_float32_values_also_among_float64_numbers():
+    solution = hjb.hopf(free_motion(hjb.Ball(1.0, 3), hjb.convex.ball(np.zeros(3), 0.5)), 1.0, intervals=2)
+    with jax.enable_x64(True):
+        found = jax.jit(solution.value_at)(0.0, jnp.asarray([3.0, 0.0, 4.0], jnp.float32))
+    assert found.dtype == np.float32
+    assert abs(float(found) - 3.5) < 2e-3
+
+
+@pytest.mark.slow
 def test_derivatives_by_the_terminal_cost_and_of_the_control():
     """x' = u, |u| ≤ 1: V = |x − c| − t − r, whose second derivative is that of the distance; u = −DV."""
 

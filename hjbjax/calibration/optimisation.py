@@ -138,8 +138,8 @@ def fit(
         the initial ones. The best run counts.
       seed: of the random numbers of restarts and of the check.
       check_gradient: compare the gradient at the initial parameters with a finite difference, and warn if they differ.
-      tol: a run has converged if the loss changed by less than this fraction of its whole decrease over the last tenth
-        of the steps, and at least ten. It ends early below a thousandth of this fraction.
+      tol: a run has converged if the loss changed by less than this fraction over the last tenth of the steps, and at
+        least ten. The fraction is of the decrease since the first tenth. It ends early below a thousandth of it.
       time_limit: seconds, including compilation.
       progress: show a bar of the steps after a second; ``None``: on a terminal.
 
@@ -241,6 +241,8 @@ def _task(loss: Callable, parameters: Any, optimiser: Any, bounds: tuple[Any, An
         value = jnp.asarray(loss(unravel(z * scale)))
         if value.shape != ():
             raise ValueError(f"fit: the loss returned shape {value.shape}, wanted one number")
+        if jnp.iscomplexobj(value):
+            raise TypeError("fit: the loss returned a complex number, wanted a real one")
         return value.astype(jnp.float64)
 
     @jax.jit
@@ -264,10 +266,10 @@ def _bounds(bounds: Any, initial: Any, flat: np.ndarray) -> tuple[np.ndarray, np
         raise ValueError(f"fit: got bounds = {bounds!r:.200}, wanted a pair (lower, upper)")
     ends = []
     for end in bounds:
-        if np.ndim(end) == 0 and not isinstance(end, dict):
+        structures: list[Any] = [jax.tree.structure(end), jax.tree.structure(initial)]
+        if structures[0] == jax.tree.structure(0.0) and np.ndim(end) == 0:
             ends.append(np.full(flat.shape, float(end)))
             continue
-        structures: list[Any] = [jax.tree.structure(end), jax.tree.structure(initial)]
         if structures[0] != structures[1]:
             raise ValueError("fit: the bounds and the parameters have different structures; wanted one per parameter")
         each = jax.tree.map(lambda bound, leaf: np.broadcast_to(np.asarray(bound, float), leaf.shape), end, initial)
@@ -286,7 +288,8 @@ def _random_start(task: _Task, draw: np.random.Generator) -> np.ndarray:
     finite = np.isfinite(task.lower) & np.isfinite(task.upper)
     low, high = np.where(finite, task.lower, 0.0), np.where(finite, task.upper, 1.0)
     uniform = low + (high - low) * draw.uniform(size=task.start.shape)
-    around = task.start * np.exp(draw.normal(size=task.start.shape)) + 0.0
+    apart = draw.normal(size=task.start.shape)
+    around = np.where(task.start != 0, task.start * np.exp(apart), apart)  # a zero has the scale 1
     return np.clip(np.where(finite, uniform, around), task.lower, task.upper)
 
 
@@ -320,7 +323,8 @@ def _run(task: _Task, start: np.ndarray, steps: int, tol: float, clock: Clock, b
             bar.update(1)
         if len(run.history) > patience:
             # the range of the last losses, because an optimiser with momentum may overshoot for some steps
-            moved, whole = float(np.ptp(run.history[-patience:])), run.history[0] - run.loss
+            # and the largest of the first losses, because a start at the optimum is the least of all losses
+            moved, whole = float(np.ptp(run.history[-patience:])), max(run.history[:patience]) - run.loss
             run.status = Status.CONVERGED if moved <= tol * whole else Status.MAX_STEPS
             if moved <= EARLY * tol * whole:
                 break
@@ -330,8 +334,10 @@ def _run(task: _Task, start: np.ndarray, steps: int, tol: float, clock: Clock, b
 
 def _gradient_error(task: _Task, draw: np.random.Generator) -> float:
     """The relative difference of the slope along a random direction from a central difference; warns if it is large."""
-    direction = draw.choice([-1.0, 1.0], task.start.shape)
-    z = jnp.asarray(task.start)
+    # inside the bounds, outside of which the loss may have no value
+    reach = np.minimum(DIFFERENCE, (task.upper - task.lower) / 2)
+    z = jnp.asarray(np.clip(task.start, task.lower + reach, task.upper - reach))
+    direction = draw.choice([-1.0, 1.0], task.start.shape) * reach / DIFFERENCE
     slope = float(task.value_and_grad(z)[1] @ direction)
     above, below = (float(task.loss(z + sign * DIFFERENCE * direction)) for sign in (1, -1))
     difference = (above - below) / (2 * DIFFERENCE)

@@ -33,7 +33,7 @@ from hjbjax.solution.status import Status
 Places = tuple[tuple[int, ...], ...]
 
 
-@pytree_dataclass(static=("rule", "bound", "states", "controls", "disturbances", "labels"), host=("problem",))
+@pytree_dataclass(static=("rule", "bound", "states", "controls", "disturbances", "labels", "count"), host=("problem",))
 class BlockSolution(files.Saved):
     """The value of a problem that separates into blocks; made by ``Decomposition.solve`` and ``march``.
 
@@ -45,6 +45,7 @@ class BlockSolution(files.Saved):
       controls: the numbers of the controls of every block.
       disturbances: the numbers of the disturbances of every block.
       labels: names and units of the controls, the side of the level set, and whether V is a cost or a reward.
+      count: the number of states n; states that are in no block have no effect on V.
       problem: the whole problem; ``None`` on return from ``jit`` or from a file; host data.
     """
 
@@ -57,6 +58,7 @@ class BlockSolution(files.Saved):
     controls: Places
     disturbances: Places
     labels: Labels = Labels()
+    count: int = 0
     problem: Problem | None = None
 
     @property
@@ -68,7 +70,7 @@ class BlockSolution(files.Saved):
     @property
     def ndim(self) -> int:
         """The number of states n."""
-        return self._count(self.states)
+        return self.count
 
     @property
     def times(self) -> Any:
@@ -119,7 +121,7 @@ class BlockSolution(files.Saved):
 
     def costate_at(self, *where: Numbers | Sequence, clamp: bool = False) -> Any:
         """DV, shape ``x.shape[:-1] + (n,)``: of all blocks for a sum, otherwise of the block whose value V is."""
-        n = self._count(self.states)
+        n = self.count
         if self.rule == FIRST:
             _, leading, moment = self._first_time(where, clamp)
             slopes = self._of_parts("costate_at", (moment, where[-1]), clamp)
@@ -173,7 +175,7 @@ class BlockSolution(files.Saved):
             header, own = archive.contents(part)
             headers.append(header)
             arrays |= {f"part{i}.{name}": array for name, array in own.items()}
-        names = ("rule", "bound", "states", "controls", "disturbances", "labels")
+        names = ("rule", "bound", "states", "controls", "disturbances", "labels", "count")
         return {"parts": headers, **{name: getattr(self, name) for name in names}}, arrays
 
     @staticmethod
@@ -197,11 +199,11 @@ class BlockSolution(files.Saved):
         )
         return cls(
             tuple(parts), header["rule"], header["bound"], states, controls, disturbances,
-            labelling.of_file(header["labels"]),
+            labelling.of_file(header["labels"]), int(header["count"]),
         )  # fmt: skip
 
     def _count(self, places: Places) -> int:
-        """The number of states, controls or disturbances of the whole problem."""
+        """The number of controls or disturbances of the whole problem."""
         return max((place + 1 for each in places for place in each), default=0)
 
     def _own_states(self, where: tuple) -> list[tuple]:
@@ -209,7 +211,7 @@ class BlockSolution(files.Saved):
         *time, x = where
         xp: Any = jnp if is_traced(x) else np
         x = xp.asarray(x)
-        n = self._count(self.states)
+        n = self.count
         if x.ndim == 0 or x.shape[-1] < n:
             raise ValueError(f"BlockSolution: got states of shape {x.shape}, wanted (..., {n})")
         return [(*time, x[..., np.array(each, int)]) for each in self.states]

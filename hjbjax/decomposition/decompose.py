@@ -33,8 +33,8 @@ def decompose(problem: Problem, states: int, *, bound: bool = False) -> "Decompo
       states: the number of states n.
 
     Keyword Args:
-      bound: let blocks share states, controls and disturbances. The value is then a bound of V, except for the union of
-        targets of one player. Default: blocks that share an input are one block.
+      bound: accept a bound of V, and let blocks share states, controls and disturbances. The union of targets of one
+        player remains exact. Default: blocks that share an input are one block, and a bound is refused.
 
     Returns:
       A Decomposition, whose ``solve`` and ``march`` solve the blocks.
@@ -172,7 +172,7 @@ class Decomposition:
         return BlockSolution(
             tuple(found), self.rule, self.bound, self.states, self.controls,
             tuple(each.disturbances for each in self.blocks.blocks), self.problem.labels._replace(payoff=side),
-            problem=self.problem,
+            self.count, problem=self.problem,
         )  # fmt: skip
 
     def __repr__(self) -> str:

@@ -2,8 +2,9 @@
 
 The jaxpr of a function is evaluated with *separated* scalars: numbers with the set of the inputs on which each depends.
 A sum keeps one number per set of inputs, and so do a maximum and a minimum. Every other operation first joins its
-operands into one number that depends on all their inputs. Numbers in the leaves of a function may change, so only
-factors in the code have a known sign, which decides whether a maximum stays one.
+operands into one number that depends on all their inputs. Constants become a part of a number with inputs. A factor
+that is known decides whether a maximum stays one, and a product with a known zero depends on nothing. A number that is
+traced is unknown.
 """
 
 from __future__ import annotations
@@ -68,18 +69,27 @@ def structure(function: Callable, shapes: Sequence[tuple[int, ...]], first: Sequ
     """The kinds and the inputs of a function's entries, in order, without numbers.
 
     Args:
-      function: a function as a pytree, whose leaves are unknown numbers here.
+      function: a function as a pytree.
       shapes: the shapes of its arguments.
       first: as in ``separated``.
     """
     found: list[Separated] = []
 
-    def run(function: Callable, *arguments: jax.Array) -> int:
+    def run(*arguments: jax.Array) -> int:
         entries = separated(function, arguments, first)
         found.extend(Separated(each.kind, dict.fromkeys(each.parts)) for each in entries.reshape(-1))
         return 0
 
-    jax.eval_shape(run, function, *(jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in shapes))
+    jax.eval_shape(run, *(jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in shapes))
+    return found
+
+
+def structure_for_any_leaves(
+    function: Callable, shapes: Sequence[tuple[int, ...]], first: Sequence[int | None]
+) -> list[Separated]:
+    """``structure`` if the leaves of the function are unknown, as in a compiled program."""
+    found: list[Separated] = []
+    jax.eval_shape(lambda function: found.extend(structure(function, shapes, first)), function)
     return found
 
 
@@ -115,6 +125,9 @@ def _merge(kind: str, left: Separated, right: Separated) -> Separated:
     parts = dict(left.parts)
     for inputs, number in right.parts.items():
         parts[inputs] = _numbers(OPERATIONS[kind], parts[inputs], number) if inputs in parts else number
+    if NONE in parts and len(parts) > 1:  # a constant belongs to any part
+        constant, home = parts.pop(NONE), next(inputs for inputs in parts if inputs)
+        parts[home] = _numbers(OPERATIONS[kind], parts[home], constant)
     return Separated(kind if len(parts) > 1 else ONE, parts)
 
 
@@ -136,11 +149,13 @@ def _negative(value: Separated) -> Separated:
 def _scaled(value: Separated, factor: Separated, operation: Callable) -> Separated:
     """A scalar times a constant, or divided by it."""
     (number,) = factor.parts.values()
-    known = not isinstance(number, jax.core.Tracer)
-    if value.kind in (MAX, MIN) and not (known and number != 0):
+    sign = None if isinstance(number, jax.core.Tracer) else float(np.sign(np.asarray(number)))
+    if sign == 0 and operation is jax.lax.mul:
+        return Separated(ONE, {NONE: np.zeros((), jnp.result_type(number, *value.parts.values()))})
+    if value.kind in (MAX, MIN) and sign not in (-1, 1):
         value = _as_one(value)
     parts = {inputs: _numbers(operation, part, number) for inputs, part in value.parts.items()}
-    flipped = value.kind in (MAX, MIN) and number < 0
+    flipped = value.kind in (MAX, MIN) and sign == -1
     return Separated({MAX: MIN, MIN: MAX}[value.kind] if flipped else value.kind, parts)
 
 
@@ -148,7 +163,9 @@ class _Separation(Algebra):
     """The algebra of separated scalars for ``evaluate_jaxpr``."""
 
     def constant(self, value: Numbers, index: tuple[int, ...]) -> Separated:
-        return Separated(ONE, {NONE: value[index] if np.ndim(value) else value})  # type: ignore[index]
+        if not isinstance(value, jax.core.Tracer):  # a trace would make the entry of a JAX array a tracer
+            value = np.asarray(value)
+        return Separated(ONE, {NONE: value[index]})
 
     def entrywise(
         self, primitive: jex.Primitive, params: dict, operands: list[Separated], dtypes: Sequence[np.dtype]
@@ -167,6 +184,10 @@ class _Separation(Algebra):
             return self.combine(jax.lax.mul, dtypes[0], *operands)
         if floating and name == "div" and not operands[1].inputs:
             return _scaled(operands[0], _as_one(operands[1]), jax.lax.div)
+        if name == "select_n" and not operands[0].inputs:
+            (case,) = _as_one(operands[0]).parts.values()
+            if not isinstance(case, jax.core.Tracer):
+                return operands[1 + int(case)]
         if name in _LINEAR and floating and jnp.issubdtype(params.get("new_dtype", np.float64), jnp.floating):
             parts = operands[0].parts.items()
             moved = {inputs: primitive.bind(jnp.asarray(number, dtypes[0]), **params) for inputs, number in parts}

@@ -28,7 +28,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.decomposition.separation import MAX, MIN, NONE, ONE, SUM, Inputs, Separated, merged, separated, structure
+from hjbjax.decomposition.separation import (
+    MAX,
+    MIN,
+    NONE,
+    ONE,
+    SUM,
+    Inputs,
+    Separated,
+    merged,
+    separated,
+    structure,
+    structure_for_any_leaves,
+)
 from hjbjax.problem.labels import REWARD
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
@@ -112,11 +124,14 @@ def find_blocks(problem: Problem, n: int, *, bound: bool) -> Blocks:
     keys = {key for each in found.values() for key in each.parts if key}
     whole = [(_closure(key, reads, n), frozenset({key})) for key in sorted(keys, key=sorted)]
     groups = _contained(whole) if bound else whole
-    groups = _joined_groups(groups, _common(problem, names), share=bound)
+    groups = _with_states(_joined_groups(groups, _common(problem, names), share=bound), names)
     if len(groups) < 2:
         raise ValueError(_coupling(problem, reads, found, names, bound))
     shared = frozenset().union(*(a & b for (a, _), (b, _) in itertools.combinations(groups, 2)))
     side = _side(problem, rule, shared, names)
+    if side is not None and not bound:
+        why = "of an obstacle that is an intersection" if rule == MIN else "of a game into an intersection"
+        raise ValueError(f"decompose: the values of the blocks {why} only give an {side} bound of V; pass bound=True")
     return Blocks(rule, tuple(_block(inputs, keys, names) for inputs, keys in groups), side)
 
 
@@ -250,18 +265,28 @@ def _common(problem: Problem, names: Names) -> list[Inputs]:
 def _joined_groups(groups: Sequence[Group], common: Sequence[Inputs], *, share: bool) -> list[Group]:
     """Groups joined if they share inputs, unless they may, or use inputs that a set couples."""
     found: list[Group] = []
-    for group in groups:
-        inputs, keys = group
+    for inputs, keys in groups:
+        inputs = inputs.union(*(each for each in common if inputs & each))
         rest = []
         for other in found:
-            coupled = any(inputs & each and other[0] & each for each in common)
-            if coupled or (not share and inputs & other[0]):
+            if any(inputs & other[0] & each for each in common) or (not share and inputs & other[0]):
                 inputs, keys = inputs | other[0], keys | other[1]
             else:
                 rest.append(other)
         found = [*rest, (inputs, keys)]
     # a group that has grown may now meet an earlier one
     return found if len(found) == len(groups) else _joined_groups(found, common, share=share)
+
+
+def _with_states(groups: Sequence[Group], names: Names) -> list[Group]:
+    """The groups that have states; the first one also gets the inputs that drive no state, or are not used at all."""
+    found = sorted((group for group in groups if any(i < names.n for i in group[0])), key=lambda group: min(group[0]))
+    if not found:
+        return []
+    used = frozenset().union(*(inputs for inputs, _ in found))
+    idle = frozenset(range(names.n, names.n + names.m + names.k)) - used
+    keys = frozenset().union(*(keys for _, keys in groups)) - frozenset().union(*(keys for _, keys in found))
+    return [(found[0][0] | idle, found[0][1] | keys), *found[1:]]
 
 
 def _side(problem: Problem, rule: str, shared: Inputs, names: Names) -> str | None:
@@ -292,32 +317,62 @@ def _block(inputs: Inputs, keys: frozenset[Inputs], names: Names) -> Block:
 
 def _coupling(problem: Problem, reads: Sequence[Inputs], found: dict[str, Separated], names: Names, bound: bool) -> str:
     """The message about a problem that does not fall apart."""
-    lines = [f"decompose: the {names.n} states are one block, so there is nothing to decompose:"]
+    couplings: list[tuple[str, Inputs]] = []  # in words, and the inputs that are coupled
     for i, each in enumerate(reads):
         others = frozenset(j for j in each if j < names.n and j != i)
         if others:
-            lines.append(f"  the drift of x[{i}] reads {names.of(others)}")
+            couplings.append((f"the drift of x[{i}] reads {names.of(others)}", others | {i}))
     for name, whole in found.items():
         for key in sorted(whole.parts, key=sorted):
             if len([j for j in key if j < names.n]) > 1:
-                lines.append(f"  {name} has a term that reads {names.of(key)} together")
-    users: dict[int, list[int]] = {}
-    for i, each in enumerate(reads):
-        for j in each:
-            if j >= names.n:
-                users.setdefault(j, []).append(i)
-    for j, rows in users.items():
-        if len(rows) > 1:
-            lines.append(f"  {names.of(frozenset({j}))} drives {names.of(frozenset(rows))}")
-    if _common(problem, names):
-        lines.append("  a set that is not a Box couples all its inputs")
+                couplings.append((f"{name} has a term that reads {names.of(key)} together", key))
+    for j in range(names.n, names.n + names.m + names.k):
+        rows = frozenset(i for i, each in enumerate(reads) if j in each)
+        if rows:
+            driven = f"{names.of(frozenset({j}))} drives {names.of(rows)}"
+            couplings.append((driven if len(rows) > 1 else "", rows | {j}))
+    couplings += [("a set that is not a Box couples all its inputs", each) for each in _common(problem, names)]
+    lines = [f"  {words}" for words in _most_separating_first(couplings, names.n) if words]
     lines = [*lines[:6], *(["  and others"] if len(lines) > 6 else [])]
     if not bound:
         lines.append("Solve it on one grid, or pass bound=True to let subsystems share states and inputs.")
-    return "\n".join(lines)
+    return "\n".join([f"decompose: the {names.n} states are one block, so there is nothing to decompose:", *lines])
 
 
-@pytree_dataclass(static=("names", "block", "timed", "role", "sizes"))
+def _most_separating_first(couplings: Sequence[tuple[str, Inputs]], n: int) -> list[str]:
+    """The couplings in words, in the order of the largest block of states that would remain without each."""
+
+    def largest_without(left_out: int) -> int:
+        blocks = [frozenset({i}) for i in range(n)]
+        for i, (_, inputs) in enumerate(couplings):
+            if i != left_out:
+                meeting = [each for each in blocks if each & inputs]
+                blocks = [each for each in blocks if not each & inputs] + [inputs.union(*meeting)]
+        return max(sum(i < n for i in each) for each in blocks)
+
+    order = sorted(range(len(couplings)), key=largest_without)  # stable: equal ones stay in the order of the states
+    return [couplings[i][0] for i in order]
+
+
+class _Fixed:
+    """A function whose leaves are constants of compiled programs, because they decide how it separates."""
+
+    def __init__(self, function: Any):
+        self.function = function
+        leaves, structure = jax.tree.flatten(function)
+        self._key = (structure, tuple((np.shape(leaf), np.asarray(leaf, float).tobytes()) for leaf in leaves))
+
+    def __call__(self, *arguments: Array) -> Any:
+        return self.function(*arguments)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Fixed) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+@pytree_dataclass(static=("names", "block", "timed", "rows", "sizes"))
 class BlockFunction:
     """A function of the problem, restricted to the inputs of one block.
 
@@ -327,8 +382,8 @@ class BlockFunction:
       names: the numbers of states, controls and disturbances.
       block: the block.
       timed: True if the time comes first.
-      role: "rows" for the rows of the drift or the noise that belong to the states of the block; otherwise "first" for
-        the part that also has the constants, or "other".
+      rows: True for the rows of the drift or the noise that belong to the states of the block, False for the part of a
+        payment or a distance.
     """
 
     function: Any
@@ -336,7 +391,7 @@ class BlockFunction:
     names: Names
     block: Block
     timed: bool
-    role: str
+    rows: bool
 
     def __call__(self, *arguments: Array) -> jax.Array:
         """The rows, or the part."""
@@ -347,12 +402,11 @@ class BlockFunction:
         for i, (size, places) in enumerate(zip(self.sizes, own, strict=False)):
             zeros = jnp.zeros(size, dtype)  # a block without disturbances has no argument for them
             whole.append(zeros.at[np.array(places, int)].set(rest[i]) if places else zeros)
-        if self.role == "rows":
+        if self.rows:
             return _rows(jnp.asarray(self.function(*time, *whole)), self.block.states)
         first: list[int | None] = [None] * self.timed + [0, self.names.n, self.names.n + self.names.m][: len(whole)]
         (value,) = separated(self.function, (*time, *whole), first).reshape(-1)
-        keys = self.block.keys | ({NONE} if self.role == "first" else frozenset())
-        found = merged(value, keys.__contains__)
+        found = merged(value, (self.block.keys | {NONE}).__contains__)
         assert found is not None
         return jnp.asarray(found)
 
@@ -373,7 +427,7 @@ def block_problem(problem: Problem, blocks: Blocks, index: int, n: int) -> Probl
         if not callable(function):
             return None if function is None else np.asarray(_rows(jnp.asarray(function), block.states))
         sizes = tuple(shape[0] for shape in _arguments(problem, name, names)[0] if shape)
-        return BlockFunction(function, sizes, names, block, problem.time_dependent, "rows")
+        return BlockFunction(function, sizes, names, block, problem.time_dependent, True)
 
     def part(name: str) -> Any:
         function = getattr(problem, name)
@@ -381,12 +435,14 @@ def block_problem(problem: Problem, blocks: Blocks, index: int, n: int) -> Probl
             return function if index == 0 or blocks.rule != SUM else None
         shapes, first = _arguments(problem, name, names)
         with own_settings(x64=None if is_traced(problem) else True):
-            (found,) = structure(function, shapes, first)
-        constant = NONE in found.parts and _takes_constants(found, blocks, index)
-        if not constant and not block.keys & found.parts.keys():
+            (found,), (blind,) = (each(function, shapes, first) for each in (structure, structure_for_any_leaves))
+        of_no_block = not found.inputs and index == 0
+        if not of_no_block and not block.keys & found.parts.keys():
             return None
+        if found != blind and not is_traced(function):
+            function = jax.tree_util.Partial(_Fixed(function))
         sizes = tuple(shape[0] for shape in shapes if shape)
-        return BlockFunction(function, sizes, names, block, problem.time_dependent, "first" if constant else "other")
+        return BlockFunction(function, sizes, names, block, problem.time_dependent, False)
 
     parts = {name: part(name) for name in (*PAID, *ENDS, *LIMITS)}
     if blocks.rule == FIRST:  # the block is inside at the end of the horizon, and the moment is chosen for all together
@@ -399,12 +455,6 @@ def block_problem(problem: Problem, blocks: Blocks, index: int, n: int) -> Probl
         control_units=[problem.control_units[j] for j in block.controls] if problem.control_units else (),
         **parts,
     )  # fmt: skip
-
-
-def _takes_constants(found: Separated, blocks: Blocks, index: int) -> bool:
-    """True if this block is the first one with a part of a function, so that the constants belong to it."""
-    owners = [i for i, each in enumerate(blocks.blocks) if each.keys & found.parts.keys()]
-    return index == (owners[0] if owners else 0)
 
 
 def _part_of_set(admissible: Any, places: tuple[int, ...], count: int) -> Any:

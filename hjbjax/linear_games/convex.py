@@ -18,9 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hjbjax.problem import arguments
 from hjbjax.problem.pytree import as_partial, is_traced, numbers, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, Numbers, State
+from hjbjax.tracing.closures import opened
 
 __all__ = ["ball", "box", "ellipsoid", "half_space", "largest", "smooth"]
 
@@ -47,6 +49,12 @@ class Largest:
         affine = jnp.asarray(self.rows) @ x - jnp.asarray(self.offsets)
         round_ones = [jnp.linalg.norm(jnp.asarray(m) @ x - c) - b for m, c, b in self.norms]
         return jnp.max(jnp.concatenate([affine, jnp.stack(round_ones)]) if round_ones else affine)
+
+    def magnitude(self, x: State) -> Array:
+        """The size of the terms of J(x), whose rounding the value inherits."""
+        rows = jnp.concatenate([self.rows, *(m for m, _, _ in self.norms)])
+        level = jnp.concatenate([self.offsets, *(c for _, c, _ in self.norms), *(jnp.ravel(b) for *_, b in self.norms)])
+        return jnp.max(jnp.abs(rows) @ jnp.abs(x)) + jnp.max(jnp.abs(level))
 
     @property
     def degree(self) -> int:
@@ -92,6 +100,11 @@ class _WithoutBarrier:
     def start(self, x: State) -> tuple[Array, Array]:
         """The state, and no constraint."""
         return x, jnp.zeros_like(x)
+
+    def magnitude(self, x: State) -> Array:
+        """The size of the terms of J(x), whose rounding the value inherits."""
+        value, slope = jax.value_and_grad(lambda y: jnp.asarray(self(y), x.dtype))(x)  # type: ignore[operator]
+        return jnp.abs(value) + jnp.abs(slope) @ jnp.abs(x)
 
 
 @pytree_dataclass(static=("dim",))
@@ -296,13 +309,23 @@ def smooth(function: Callable, states: int, *, conjugate: Callable | None = None
     Raises:
       ValueError: at a random state x, J(x) + J*(p) differs from p·x with the gradient p of J.
     """
-    own = as_partial(function, "convex.smooth: function")
+    n = arguments.count(states, "convex.smooth: states")
+    own = _settled(function, n, "convex.smooth: function")
     if conjugate is None:
-        return Smooth(int(states), own)
-    found = Conjugated(int(states), own, as_partial(conjugate, "convex.smooth: conjugate"))
+        return Smooth(n, own)
+    found = Conjugated(n, own, _settled(conjugate, n, "convex.smooth: conjugate"))
     if not is_traced(found):
         _check_transform(found)
     return found
+
+
+def _settled(function: Callable, n: int, name: str) -> Any:
+    """A function of (n,) numbers as a pytree, with traced numbers among its leaves."""
+    held = as_partial(function, name)
+    if held is None:
+        raise TypeError(f"{name}: got None, wanted a function of one state")
+    shape = jax.ShapeDtypeStruct((n,), jnp.result_type(float))
+    return opened(held, shape)
 
 
 def _check_transform(found: Conjugated) -> None:

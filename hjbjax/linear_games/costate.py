@@ -16,6 +16,7 @@ of the control to rounding. The last θ gives two bounds of V without any discre
 The barriers are those of interior point methods.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +29,7 @@ from hjbjax.problem.types import Array, Number, State
 
 FALL = 0.2  # factor of μ from one barrier to the next
 NEAR = 0.1  # Newton's predicted gain, in units of μ, at which μ falls
+EXACT = 3  # Newton steps after which a point at which μ may fall is exact for derivatives
 STEPS = 200  # the largest number of Newton steps; ten to sixty are usual
 SHORTEST = 2.0**-12  # the shortest step of a line search
 FINER = 8  # nodes of the integral per interval of the control
@@ -119,32 +121,90 @@ def solve_state(game: LinearGame, along: Flow, x: State) -> StateSolution:
         push = along.tau * jnp.mean(jnp.einsum("kim,km->ki", along.other, d), axis=0)
         found = _one_player(game, along, center + push)
         better = found.lower > best.lower
-        return jax.tree.map(lambda new, old: jnp.where(better, new, old), found, best), found.costate
+        # the best reply to p does not change the bound to first order
+        following = jax.lax.stop_gradient(found.costate)
+        return jax.tree.map(lambda new, old: jnp.where(better, new, old), found, best), following
 
     first = _one_player(game, along, center)
     nothing = first._replace(value=jnp.full_like(first.value, -jnp.inf), lower=jnp.full_like(first.lower, -jnp.inf))
-    best, _ = jax.lax.fori_loop(0, REPLIES, reply, (nothing, first.costate))
+    best, _ = jax.lax.fori_loop(0, REPLIES, reply, (nothing, jax.lax.stop_gradient(first.costate)))
     return best._replace(upper=jnp.full_like(best.upper, jnp.inf))
 
 
 def _one_player(game: LinearGame, along: Flow, center: State) -> StateSolution:
     """The answer for one player, or for a game in which the player can undo the disturbance."""
-    size, smallest = _size(game, along, center)
-    begun = _Iterate(game.terminal.start(center)[0], size, 0, False)
+    size, largest = _sizes(game, along, center)
+    eps = float(jnp.finfo(center.dtype).eps)
+    rounding = 64 * eps * largest
+    smallest = size * eps**0.57 + rounding
+    # where the control has hardly any effect, the dual point still has to find the largest of the functions in J
+    begun = _Iterate(game.terminal.start(center)[0], jnp.maximum(size, largest), 0, False)
     found = jax.lax.while_loop(
         lambda now: ~now.done & (now.count < STEPS), lambda now: _step(game, along, center, smallest, now), begun
     )
     theta, mu = jax.lax.stop_gradient((found.theta, found.mu))
-    upper, discrete, p, fixed = _bounds(game, along, center, theta, mu)
-    # the optimal p and its J* do not change to first order, so derivatives of V pass through x̄ and the dynamics only
-    p, fixed = jax.lax.stop_gradient((p, fixed))
+    upper, discrete = _bounds(game, along, center, theta, mu)
+    p, fixed, _ = game.terminal.dual(theta, mu)
     integral, slack = _integral(game, along, p)
     terms = jnp.abs(integral) + jnp.abs(fixed) + jnp.abs(p) @ jnp.abs(center)
-    slack = slack + 8 * float(jnp.finfo(p.dtype).eps) * terms
-    value = fixed + p @ center - integral
+    slack = slack + 8 * eps * terms
+    theta = _maximiser(game, along, center, theta, mu)
+    value = _formula(game, along, center, theta, mu)
     value = value + jax.lax.stop_gradient(jnp.minimum(upper - value, 0))
-    gap = (upper - discrete) / jnp.where(size > 0, size, 1)
+    # less than the rounding of the terminal cost cannot be reached where the control has hardly any effect
+    gap = jnp.maximum(upper - discrete - 4 * _degree(game, along) * rounding, 0) / jnp.where(size > 0, size, 1)
+    p = game.terminal.dual(theta, mu)[0]
     return StateSolution(value, value - slack, jnp.maximum(upper, value - slack), p, _pace(along, mu), gap, found.count)
+
+
+@jax.custom_jvp
+def _maximiser(game: LinearGame, along: Flow, center: State, theta: Array, mu: Number) -> Array:
+    """The dual point θ that the iteration found, with the derivative of the maximiser by the implicit function theorem.
+
+    The derivative is that of the maximum with barriers, so it is large and finite where the maximiser jumps.
+    """
+    return theta
+
+
+@_maximiser.defjvp
+def _maximiser_derivative(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    game, along, center, theta, mu = primals
+    row = game.terminal.start(center)[1]
+    # the iteration ends when it is near enough for the value; its last steps matter for derivatives only
+    for _ in range(EXACT):
+        rising = jax.grad(_merit(game, along, center, mu))(theta)
+        theta = theta + _constrained(_curvature(game, along, theta, mu), rising, row, theta)
+    # again with its derivative, for derivatives of higher order
+    theta = _maximiser(game, along, center, jax.lax.stop_gradient(theta), mu)
+
+    def slope(game: LinearGame, along: Flow, center: State) -> Array:
+        return jax.grad(_merit(game, along, center, mu))(theta)
+
+    change = jax.jvp(slope, (game, along, center), tangents[:3])[1]
+    matrix = _curvature(game, along, theta, mu)
+    return theta, _constrained(matrix, change, row, jax.lax.stop_gradient(theta))
+
+
+def _formula_at(game: LinearGame, along: Flow, center: State, theta: Array, mu: Number) -> Array:
+    """The formula at a dual point."""
+    p, fixed, _ = game.terminal.dual(theta, mu)
+    return fixed + p @ center - _integral(game, along, p)[0]
+
+
+@jax.custom_jvp
+def _formula(game: LinearGame, along: Flow, center: State, theta: Array, mu: Number) -> Array:
+    """The formula at its maximiser θ, whose own derivative contributes nothing to the derivative of the maximum."""
+    return _formula_at(game, along, center, theta, mu)
+
+
+@_formula.defjvp
+def _formula_derivative(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    theta, mu = primals[3:]
+
+    def at(game: LinearGame, along: Flow, center: State) -> Array:
+        return _formula_at(game, along, center, theta, mu)
+
+    return jax.jvp(at, primals[:3], tangents[:3])
 
 
 def _pace(along: Flow, mu: Number) -> Array:
@@ -152,17 +212,21 @@ def _pace(along: Flow, mu: Number) -> Array:
     return mu / jnp.where(along.tau > 0, along.tau, 1)
 
 
-def _bounds(game: LinearGame, along: Flow, center: State, theta: Array, mu: Number) -> tuple[Array, ...]:
-    """Cost of the piecewise constant control at θ, the dual value, p and −J*(p)."""
+def _degree(game: LinearGame, along: Flow) -> int:
+    """The duality gap of the maximum with barriers is this number times μ."""
+    return game.terminal.degree + 2 * np.shape(along.own)[2]
+
+
+def _bounds(game: LinearGame, along: Flow, center: State, theta: Array, mu: Number) -> tuple[Array, Array]:
+    """Cost of the piecewise constant control at θ, and the dual value."""
     p, fixed, _ = game.terminal.dual(theta, mu)
+    upper = game.terminal(center + _under(game, along, _pace(along, mu), p)[1])
     w = -jnp.einsum("kim,i->km", along.own, p)
-    controls = jax.vmap(lambda one: smooth_support(game.effective, one, _pace(along, mu))[1])(w)
-    upper = game.terminal(center + along.tau * jnp.mean(jnp.einsum("kim,km->ki", along.own, controls), axis=0))
-    return upper, fixed + p @ center - along.tau * jnp.mean(support(game.effective, w)), p, fixed
+    return upper, fixed + p @ center - along.tau * jnp.mean(support(game.effective, w))
 
 
-def _size(game: LinearGame, along: Flow, center: State) -> tuple[jax.Array, jax.Array]:
-    """The effect of the control on the terminal cost, and the last μ."""
+def _sizes(game: LinearGame, along: Flow, center: State) -> tuple[jax.Array, jax.Array]:
+    """The effect of the control on the terminal cost, and the size of the terms of the terminal cost."""
     eye = jnp.eye(len(center), dtype=center.dtype)
     reach = along.tau * jnp.mean(
         jax.vmap(lambda b: jnp.stack([support(game.effective, eye @ b), support(game.effective, -eye @ b)]))(along.own),
@@ -171,31 +235,42 @@ def _size(game: LinearGame, along: Flow, center: State) -> tuple[jax.Array, jax.
     here = game.terminal(center)
     ends = jnp.concatenate([center + reach[0][:, None] * eye, center - reach[1][:, None] * eye])
     size = jnp.max(jnp.abs(jax.vmap(game.terminal)(ends) - here))
-    eps = float(jnp.finfo(center.dtype).eps)
+    eps, tiny = (float(getattr(jnp.finfo(center.dtype), name)) for name in ("eps", "tiny"))
+    largest = jnp.asarray(game.terminal.magnitude(center), center.dtype)
     # without any effect the smallest positive number keeps the divisions finite
-    size = jnp.maximum(size, eps * jnp.abs(here) + float(jnp.finfo(center.dtype).tiny) ** 0.5)
-    return jax.lax.stop_gradient(size), jax.lax.stop_gradient(size * eps**0.57 + 64 * eps * jnp.abs(here))
+    return jax.lax.stop_gradient((jnp.maximum(size, eps * largest + tiny**0.5), largest))
+
+
+def _under(game: LinearGame, along: Flow, pace: Number, p: Array) -> tuple[jax.Array, jax.Array]:
+    """τ times the means of σ_μ and of the velocity over the intervals."""
+    values, controls = jax.vmap(lambda b: smooth_support(game.effective, -p @ b, pace))(along.own)
+    mean = jnp.mean(jnp.einsum("kim,km->ki", along.own, controls), axis=0)
+    return along.tau * jnp.mean(values), along.tau * mean
+
+
+def _merit(game: LinearGame, along: Flow, center: State, mu: Number) -> Callable:
+    """The function of θ with barriers whose maximum is computed."""
+
+    def merit(theta: Array) -> Array:
+        p, fixed, barrier = game.terminal.dual(theta, mu)
+        return fixed + barrier + p @ center - _under(game, along, _pace(along, mu), p)[0]
+
+    return merit
+
+
+def _curvature(game: LinearGame, along: Flow, theta: Array, mu: Number) -> jax.Array:
+    """Minus the second derivative of the merit."""
+    to_p, p = jax.jacfwd(lambda theta: 2 * (game.terminal.dual(theta, mu)[0],), has_aux=True)(theta)
+    give = jax.jacfwd(lambda p: _under(game, along, _pace(along, mu), p)[1])(p)  # −give is positive semidefinite
+    return game.terminal.curvature(theta, mu) - to_p.T @ give @ to_p
 
 
 def _step(game: LinearGame, along: Flow, center: State, smallest: Array, now: _Iterate) -> _Iterate:
     """One Newton step with a line search, or a smaller μ."""
-    mu, theta, pace = now.mu, now.theta, _pace(along, now.mu)
-
-    def under(p: Array) -> tuple[jax.Array, jax.Array]:
-        """τ times the means of σ_μ and of the velocity over the intervals."""
-        values, controls = jax.vmap(lambda b: smooth_support(game.effective, -p @ b, pace))(along.own)
-        mean = jnp.mean(jnp.einsum("kim,km->ki", along.own, controls), axis=0)
-        return along.tau * jnp.mean(values), along.tau * mean
-
-    def merit(theta: Array) -> Array:
-        p, fixed, barrier = game.terminal.dual(theta, mu)
-        return fixed + barrier + p @ center - under(p)[0]
-
+    mu, theta = now.mu, now.theta
+    merit = _merit(game, along, center, mu)
     here, slope = jax.value_and_grad(merit)(theta)
-    to_p, p = jax.jacfwd(lambda theta: 2 * (game.terminal.dual(theta, mu)[0],), has_aux=True)(theta)
-    give = jax.jacfwd(lambda p: under(p)[1])(p)  # −give is positive semidefinite
-    matrix = game.terminal.curvature(theta, mu) - to_p.T @ give @ to_p
-    step = _constrained(matrix, slope, game.terminal.start(center)[1], theta)
+    step = _constrained(_curvature(game, along, theta, mu), slope, game.terminal.start(center)[1], theta)
     gain = slope @ step
 
     def too_long(share: Array) -> jax.Array:
@@ -205,9 +280,8 @@ def _step(game: LinearGame, along: Flow, center: State, smallest: Array, now: _I
     share = jax.lax.while_loop(too_long, lambda share: share / 2, jnp.ones((), theta.dtype))
     moved = merit(theta + share * step)
     near = gain <= NEAR * mu
-    upper, discrete, *_ = _bounds(game, along, center, theta, mu)
-    degree = game.terminal.degree + 2 * np.shape(along.own)[2]
-    last = near & (mu <= smallest) & (upper - discrete <= 4 * degree * mu)
+    upper, discrete = _bounds(game, along, center, theta, mu)
+    last = near & (mu <= smallest) & (upper - discrete <= 4 * _degree(game, along) * mu)
     fallen = jnp.where(near & ~last, jnp.maximum(FALL * mu, smallest), mu)
     keep = last | ~jnp.isfinite(moved)
     return _Iterate(jnp.where(keep, theta, theta + share * step), fallen, now.count + 1, last)

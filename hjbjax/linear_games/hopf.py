@@ -93,9 +93,8 @@ def hopf(
             "parallel to a column of B with at least the same range, or if C = B with a smaller ball.\n"
             f"Pass bound=True for {side} bound of V, or use march on a grid in up to six states"
         )
-    disturbances = None if problem.disturbances is None else problem.disturbances
     return HopfSolution(
-        game, horizon, problem.controls, disturbances, count, float(tol), problem.labels, problem=problem
+        game, horizon, problem.controls, problem.disturbances, count, float(tol), problem.labels, problem=problem
     )
 
 
@@ -104,7 +103,8 @@ class HopfSolution(files.Saved):
     """The value of a linear game with a convex terminal cost, evaluated state by state; made by ``hopf``.
 
     All times are between 0 and the horizon. Results are float64 NumPy for numbers; under ``jit``, ``vmap`` and ``grad``
-    they follow the dtype of the state, and a minimisation that does not converge gives NaN instead of an error.
+    they follow the dtype of the state, and are NaN instead of an error if a minimisation does not converge or a time is
+    outside the horizon.
 
     Args:
       game: matrices, sets and the terminal cost.
@@ -242,7 +242,7 @@ class HopfSolution(files.Saved):
         shape = np.broadcast_shapes(times.shape, states.shape[:-1])
         times, states = np.broadcast_to(times, shape).reshape(-1), np.broadcast_to(states, (*shape, n)).reshape(-1, n)
         end = float(self.horizon)
-        if np.any((times < 0) | (times > end * (1 + 1e-12))):
+        if not np.all((times >= 0) & (times <= end * (1 + 1e-12))):
             raise ValueError(
                 f"HopfSolution.{name}: got times from {times.min():g} to {times.max():g}, wanted 0 to {end:g}"
             )
@@ -355,7 +355,7 @@ def _evaluate_traced(solution: HopfSolution, name: str, t: Numbers, x: Numbers |
     n, x = solution.game.terminal.dim, jnp.asarray(x)
     x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
     _check_states(name, n, x.shape)
-    t = jnp.asarray(t, x.dtype)
+    solution, t = cast(solution, x.dtype), jnp.asarray(t, x.dtype)
     if t.ndim:  # every state has its own tables of the dynamics
         t, x = jnp.broadcast_to(t, x.shape[:-1]).reshape(-1, 1), x.reshape(*x.shape[:-1], n)
         each = jax.vmap(lambda t, x: _lanes(solution, t[0], x[None]))(t, x.reshape(-1, n))
@@ -365,7 +365,9 @@ def _evaluate_traced(solution: HopfSolution, name: str, t: Numbers, x: Numbers |
         found, gap = each[name], each["gap"]
     tol = max(solution.tol, 20 * float(jnp.finfo(x.dtype).eps) ** 0.57)  # what the dtype allows
     gap = gap.reshape(-1, *(1,) * (found.ndim - 1))
-    return jnp.where(gap <= tol, found, jnp.nan).reshape((*x.shape[:-1], *found.shape[1:]))
+    within = (t >= 0) & (t <= solution.horizon * (1 + 4 * float(jnp.finfo(x.dtype).eps)))
+    within = jnp.broadcast_to(within.reshape(-1), len(gap)).reshape(gap.shape)
+    return jnp.where((gap <= tol) & within, found, jnp.nan).reshape((*x.shape[:-1], *found.shape[1:]))
 
 
 def _in_blocks(solution: HopfSolution, times: np.ndarray, states: np.ndarray) -> dict[str, np.ndarray]:

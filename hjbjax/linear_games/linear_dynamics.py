@@ -135,20 +135,26 @@ def _terminal(problem: Problem, states: int | None) -> tuple[ConvexFunction, boo
             "hopf: got a terminal cost that is not one of hjb.convex; wanted also states=, the number of states"
         )
     quadratic = _as_quadratic(cost, states)
-    sign = 1
     if quadratic is not None:
-        sizes = np.linalg.eigvalsh(quadratic.matrix)
-        largest = np.max(np.abs(sizes), initial=0.0)
-        if sizes[0] >= -SEMIDEFINITE * largest:
+        if _semidefinite(quadratic.matrix):
             return quadratic, False
-        sign = -1
-        if sizes[-1] <= SEMIDEFINITE * largest:
+        if _semidefinite(-quadratic.matrix):
             return Quadratic(states, -quadratic.matrix, -quadratic.slope, -quadratic.offset), True
-    why = "whose matrix has eigenvalues of both signs" if sign < 0 else "whose convexity is not known"
+    why = "whose convexity is not known" if quadratic is None else "whose matrix has eigenvalues of both signs"
     raise ValueError(
         f"hopf: got a terminal cost {why}; wanted a function of hjb.convex (ball, box, ellipsoid, half_space,\n"
         "largest), a convex quadratic polynomial, or hjb.convex.smooth(function, states) to declare it convex"
     )
+
+
+def _semidefinite(matrix: np.ndarray) -> bool:
+    """True if a symmetric matrix is positive semidefinite, up to rounding in the units of each state."""
+    diagonal = np.diagonal(matrix)
+    used = np.any(matrix != 0, axis=1)
+    if np.any(diagonal[used] <= 0):
+        return False
+    scale = np.where(used, 1 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
+    return bool(np.linalg.eigvalsh(matrix * np.outer(scale, scale))[0] >= -SEMIDEFINITE)
 
 
 def _of_module(function: Any) -> ConvexFunction | None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from hjbjax.linear_games.barriers import over_ball, over_interval, over_simplex
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex
+from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number
 
 MATCHING = 1e-9  # relative difference of two matrices that counts as rounding
@@ -83,11 +84,16 @@ def reduced(controls: AdmissibleSet, own: np.ndarray, opponents: AdmissibleSet, 
       opponents: D.
       other: C, shape (n, k).
     """
+    # in units of the states and of the largest entries of the inputs, because these may differ by any factor
+    sizes = [_largest_known(each) for each in (controls, opponents)]
+    rows = np.max(np.abs(np.concatenate([own * sizes[0], other * sizes[1]], axis=1)), axis=1, initial=0.0)
+    rows = np.where(rows > 0, rows, 1.0)[:, None]
+    own, other = own * sizes[0] / rows, other * sizes[1] / rows
     inside = np.linalg.lstsq(own, other, rcond=None)[0]  # K with C = B K, shape (m, k)
-    size = np.max(np.abs(other), initial=0.0)
-    if np.max(np.abs(own @ inside - other), initial=0.0) > MATCHING * size:
+    inside = np.where(np.abs(inside) <= MATCHING, 0.0, inside)
+    if np.max(np.abs(own @ inside - other), initial=0.0) > MATCHING:
         return None
-    inside = np.where(np.abs(inside) <= MATCHING * np.max(np.abs(inside), initial=0.0), 0.0, inside)
+    inside = inside * sizes[0][:, None] / sizes[1]
     if isinstance(controls, Box) and isinstance(opponents, Box):
         if np.any(np.sum(inside != 0, axis=0) > 1):
             return None
@@ -99,11 +105,20 @@ def reduced(controls: AdmissibleSet, own: np.ndarray, opponents: AdmissibleSet, 
         )
     if isinstance(controls, Ball) and isinstance(opponents, Ball):
         square = inside.T @ inside
-        scale = float(np.sqrt(square[0, 0]))
-        turned = inside.shape[0] == inside.shape[1] and np.allclose(square, scale**2 * np.eye(len(square)), atol=1e-9)
+        scale = float(np.sqrt(np.mean(np.diagonal(square))))
+        turned = inside.shape[0] == inside.shape[1] and np.allclose(
+            square, scale**2 * np.eye(len(square)), rtol=0, atol=MATCHING * scale**2
+        )
         radius = float(controls.radius) - scale * float(opponents.radius)
         return Ball(max(radius, 0.0), controls.dim) if turned and radius >= -MATCHING * float(controls.radius) else None
     return None
+
+
+def _largest_known(admissible: AdmissibleSet) -> np.ndarray:
+    """The largest |u_j| in the set in NumPy, shape (m,); 1 for an input that is always zero."""
+    with own_settings(x64=True):
+        found = np.asarray(largest_entries(admissible, np.float64))
+    return np.where(found > 0, found, 1.0)
 
 
 def _middle_and_half(box: Box, dtype: Any) -> tuple[jax.Array, jax.Array]:

@@ -13,7 +13,11 @@ follow the present control, so that the network is trained where they go. They b
 Euler step: paths from x₀ itself would train V(0, ·) at a single state, and neither its neighbours nor DV.
 
 After training, the mean of Y at time 0 over new paths is an unbiased estimate of the cost of the computed feedback, and
-the stochastic integral only reduces its variance. The cost exceeds V by the square of the error of DV.
+the stochastic integral only reduces its variance. The cost exceeds V by the square of the error e of DV,
+
+    cost − V ≈ ½ E ∫ e^{−βt} e'(−H_pp)e dt,    Var Y ≈ E ∫ e^{−2βt} e'σσᵀe dt,    H(t, x, p) = min_u [L + f·p]
+
+so the variance of Y over new paths bounds the excess if the noise reaches every direction in which H is curved.
 
 The method is that of W. E, J. Han and A. Jentzen, Commun. Math. Stat. 5 (2017), with one network for all times.
 """
@@ -48,6 +52,8 @@ PILOT = 256  # paths under the cheapest control that give the sizes of the input
 HELD_OUT = 256  # paths that choose the best weights
 FRESH, BLOCK = 4096, 256  # paths of the final estimate, and of each block of them
 FINER = 4  # steps of the final estimate per step of the training
+PROBED = 64  # ends of paths at which the curvature of the Hamiltonian is compared with the noise
+UNREACHED = 1e-9  # relative size of a noise or a curvature that counts as zero
 EXPLAINED = 0.1  # the largest share of the variance of the cost that the costate of a converged solution leaves
 
 
@@ -127,8 +133,8 @@ def deep_bsde(
       batch: paths per step.
       layers: widths of the hidden layers.
       rate: the initial rate of Adam, which falls to zero over the steps.
-      tol: for CONVERGED, ``error`` and ``near_error`` must be at most this fraction of the value, or of the spread of
-        the cost if that is larger, and ``unexplained`` at most 0.1.
+      tol: for CONVERGED, ``error``, ``near_error`` and a finite ``excess`` must be at most this fraction of the value,
+        or of the spread of the cost if that is larger, and ``unexplained`` at most 0.1.
       guess: a NeuralSolution of the same problem, from whose weights the training starts.
       time_limit: seconds, including compilation.
       progress: show a bar of the steps after a second; ``None``: on a terminal.
@@ -138,8 +144,10 @@ def deep_bsde(
       cost of the computed feedback from ``x0``; ``standard_error``, its sampling error; ``time_error``, its change when
       the Euler steps are halved; ``error``, the sum of two standard errors and the time error; ``near_error``, the mean
       difference of V and the cost, with two standard errors, at states near ``x0``, within the noise of one Euler step;
-      and ``unexplained``, the share of the variance of the cost that the costate leaves, which is 0 for the exact
-      value. The cost of a feedback is an upper bound of V. At other states V(t, ·) is valid where the paths are at the
+      ``unexplained``, the share of the variance of the cost that the costate leaves, which is 0 for the exact value;
+      and ``excess``, an estimate from above of the difference of this cost and V, which is infinite without an
+      estimate: if the noise does not reach a direction that the control moves, or if the control jumps. The cost of a
+      feedback is an upper bound of V. At other states V(t, ·) is valid where the paths are at the
       time t, which in many dimensions is a shell: the middle of the paths may be far from all of them.
 
     Raises:
@@ -247,7 +255,7 @@ def _path_loss(plant: Plant, ansatz: HorizonAnsatz, intervals: int, key: Key) ->
 
 @jax.jit
 def _costs(plant: Plant, ansatz: HorizonAnsatz, intervals: Array, spread: Array, keys: Any) -> dict[str, jax.Array]:
-    """Y, the cost of closed loops, and V(0, ·) at their starts, shape (k,) each, and the corners of their box.
+    """Y, the cost of closed loops, and V(0, ·) at their starts, shape (k,) each, the corners of their box, and ends.
 
     The starts are those of ``Plant.near_start``; x₀ itself for ``spread`` zero.
     """
@@ -265,9 +273,54 @@ def _costs(plant: Plant, ansatz: HorizonAnsatz, intervals: Array, spread: Array,
         zero, start = jnp.zeros_like(plant.horizon), plant.near_start(jax.random.fold_in(key, intervals), spread)
         x, cost, gain, lo, hi = jax.lax.fori_loop(0, intervals, step, (start, zero, zero, start, start))
         total = cost + jnp.exp(-problem.discount * plant.horizon) * terminal_cost(problem, plant.horizon, x)
-        return {"cost": total, "y": total - gain, "value": ansatz(problem, 0.0, start), "lo": lo, "hi": hi}
+        found = {"cost": total, "y": total - gain, "value": ansatz(problem, 0.0, start)}
+        return found | {"lo": lo, "hi": hi, "end": x}
 
     return jax.vmap(path)(keys)
+
+
+@jax.jit
+def _curvatures(plant: Plant, ansatz: HorizonAnsatz, t: Array, x: Array) -> tuple[jax.Array, jax.Array]:
+    """−H_pp and σσᵀ at times (k,) and states (k, n), shape (k, n, n) each."""
+    problem = plant.problem
+
+    def one(t: Number, x: State) -> tuple[jax.Array, jax.Array]:
+        p = jax.grad(ansatz, 2)(problem, t, x)
+        u = plant.control(t, x, p)
+
+        def rate(p: State) -> jax.Array:  # H_p
+            return jnp.asarray(problem.drift(*problem.arguments(x, plant.control(t, x, p), t=t)), x.dtype)
+
+        sigma = jnp.asarray(problem.diffusion(x, u, None, t), x.dtype)
+        bent = -jax.jacfwd(rate)(p)
+        return (bent + bent.T) / 2, sigma @ sigma.T
+
+    return jax.vmap(one)(t, x)
+
+
+def _excess(plant: Plant, ansatz: HorizonAnsatz, ends: np.ndarray, variance: float) -> float:
+    """An upper estimate of the cost of the feedback minus V, from the variance of Y; infinite if there is none."""
+    if plant.rule is None:
+        return 0.0
+    if plant.rule.jumps:
+        return np.inf
+    states = np.concatenate([np.asarray(plant.start)[None], ends[:PROBED]])
+    times = np.append(0.0, np.full(len(states) - 1, float(plant.horizon)))
+    ratios = [
+        _largest_ratio(*map(np.asarray, each)) for each in zip(*_curvatures(plant, ansatz, times, states), strict=True)
+    ]
+    return max(ratios) / 2 * float(np.exp(plant.problem.discount * plant.horizon)) * variance
+
+
+def _largest_ratio(bent: np.ndarray, noise: np.ndarray) -> float:
+    """The largest e'Se / e'Ne of two positive semidefinite matrices."""
+    sizes, vectors = np.linalg.eigh(noise)
+    reached = sizes > UNREACHED * max(sizes[-1], np.finfo(float).tiny)
+    beyond = np.abs(bent @ vectors[:, ~reached])
+    if np.max(beyond, initial=0.0) > UNREACHED * np.max(np.abs(bent)):
+        return np.inf
+    root = vectors[:, reached] / np.sqrt(sizes[reached])
+    return float(max(np.linalg.eigvalsh(root.T @ bent @ root)[-1], 0.0))
 
 
 def _report(
@@ -293,10 +346,12 @@ def _report(
     validation = {
         "value": value, "error": 2 * sampling + by_time, "standard_error": sampling, "time_error": by_time,
         "near_error": abs(float(np.mean(off))) + 2 * float(np.std(off) / np.sqrt(FRESH)), "unexplained": unexplained,
+        "excess": _excess(plant, ansatz, fine["end"], float(np.var(fine["y"]))),
     }  # fmt: skip
     status = found.status
     if status is Status.MAX_STEPS:
-        largest = max(validation["error"], validation["near_error"])
+        known = validation["excess"] if np.isfinite(validation["excess"]) else 0.0
+        largest = max(validation["error"], validation["near_error"], known)
         accurate = largest <= tol * max(abs(value), np.sqrt(raw)) and unexplained <= EXPLAINED
         status = Status.CONVERGED if accurate else Status.MAX_STEPS
     if not np.isfinite(value):

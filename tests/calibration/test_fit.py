@@ -1,5 +1,7 @@
 """Fits: optima that are known, bounds, checks and interrupts, and parameters recovered from closed loops."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +35,48 @@ def test_bounds_hold():
     assert np.allclose([found.parameters["a"], *found.parameters["b"]], [2, 1, -1.5], atol=5e-3)
     with pytest.raises(ValueError, match="not within the bounds"):
         hjb.fit(bowl, START, bounds=(0.0, 2.0))
+
+
+@pytest.mark.parametrize("start", [3.0, 3.0 + 1e-7])
+def test_a_start_at_the_optimum_has_converged(start):
+    """The slope of rounding size makes Adam leave the optimum, and the start remains the best."""
+    found = hjb.fit(lambda p: (p - 3.0) ** 2 + 1e-13 * p + 5.0, start)
+    assert found.status is hjb.Status.CONVERGED
+    assert found.parameters == start
+
+
+def test_the_gradient_is_checked_inside_the_bounds():
+    root = lambda p: jnp.sum(jnp.sqrt(p - 1.0)) + p[0]  # noqa: E731
+    bounds = np.array([1.0, 1.0, 2.5]), np.array([4.0, 2.0, 2.5])
+    found = hjb.fit(root, np.array([1.001, 2.0, 2.5]), bounds=bounds, check_gradient=True, steps=2)
+    assert found.gradient_error < 1e-2
+
+
+@dataclasses.dataclass
+class Pair:
+    first: float
+    second: np.ndarray
+
+
+jax.tree_util.register_dataclass(Pair, ["first", "second"], [])
+
+
+@pytest.mark.parametrize("kind", [Pair, lambda *each: [*each]])
+def test_bounds_have_the_structure_of_the_parameters(kind):
+    loss = lambda p: sum(jnp.sum((leaf - 2.0) ** 2) for leaf in jax.tree.leaves(p))  # noqa: E731
+    bounds = kind(np.float64(0.0), np.zeros(2)), kind(np.float64(1.5), np.full(2, 9.0))
+    found = hjb.fit(loss, kind(1.0, np.ones(2)), bounds=bounds)
+    assert np.allclose(np.hstack(jax.tree.leaves(found.parameters)), [1.5, 2, 2], atol=5e-3)
+
+
+def test_restarts_leave_zero():
+    found = hjb.fit(lambda p: (p - 1.0) ** 2, 0.0, restarts=2, steps=1)
+    assert len(set(found.starts)) == 3
+
+
+def test_a_complex_loss_is_refused():
+    with pytest.raises(TypeError, match="complex"):
+        hjb.fit(lambda p: p + 1j, 1.0)
 
 
 @pytest.mark.slow

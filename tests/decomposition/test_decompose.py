@@ -77,6 +77,89 @@ def test_the_rule_and_the_parts_are_read_from_the_trace(cost, parts):
     assert abs(combined - float(cost(x))) < 1e-6
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_blocks_of_matrices_are_found_in_any_order(seed):
+    """Matrices that the functions close over: their zeros are known."""
+    draw, sizes, m = np.random.default_rng(seed), (3, 2, 1), 3
+    state, control = draw.permutation(6), draw.permutation(m)
+    mine = np.repeat(np.arange(3), sizes)[state]  # the block of each state
+    own = np.arange(m)[control]
+    a, q = (draw.normal(size=(6, 6)) * (mine[:, None] == mine) for _ in range(2))
+    b = draw.normal(size=(6, m)) * (mine[:, None] == own)
+    cost = lambda x, u: x @ q @ x + 2 * u @ u + 0.7  # noqa: E731
+    problem = hjb.Problem(lambda x, u: a @ x + b @ u, cost, hjb.Box([-1.0] * m, [1.0] * m), discount=1.0)
+    found = hjb.decompose(problem, 6)
+    blocks = sorted(tuple(np.nonzero(mine == k)[0].tolist()) for k in range(3))
+    assert sorted(found.states) == blocks
+    x, u = draw.normal(size=6), draw.normal(size=m)
+    total = 0.0
+    for part, states, controls in zip(found.problems, found.states, found.controls, strict=True):
+        own_x, own_u = x[list(states)], u[list(controls)]
+        total += float(part.cost(own_x, own_u))
+        assert np.allclose(part.drift(own_x, own_u), (a @ x + b @ u)[list(states)], atol=1e-5)
+        assert set(mine[list(states)]) == set(own[list(controls)])
+    assert abs(total - cost(x, u)) < 1e-5
+
+
+FACTOR, MASK = 2.0, np.array([True, False, True, False])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"drift": lambda x, u: jnp.stack([x[1] + 0 * x[2], u[0], x[3] + 0.0 * x[0] * u[0], u[1]])},
+        {"drift": lambda x, u: jnp.where(MASK, x[jnp.array([1, 2, 3, 0])], u[jnp.array([0, 0, 1, 1])])},
+        {"cost": lambda x, u: squares(x, u) + 0.0 * x[0] * x[2]},
+        {"cost": None, "terminal_cost": lambda x: -FACTOR * jnp.minimum(-jnp.abs(x[0]) + 0.1, x[2]) - 0.4},
+        {"cost": None, "terminal_cost": lambda x: jnp.abs(x[0]) - 0.5, "running_max": lambda x: x[2] ** 2 - 0.3},
+    ],
+)
+def test_known_factors_couple_nothing(change):
+    assert hjb.decompose(hjb.Problem(**{**INTEGRATORS, "cost": squares, **change}), 4).states == ((0, 1), (2, 3))
+
+
+def test_the_coupling_comes_first_in_the_message():
+    """Two chains of five states with one common term."""
+    chains = lambda x, u: jnp.concatenate([x[1:5], u[:1], x[6:], u[1:]])  # noqa: E731
+    problem = hjb.Problem(chains, lambda x, u: squares(x, u) + 0.1 * x[2] * x[7], INTEGRATORS["controls"], discount=1.0)
+    with pytest.raises(ValueError, match=r"nothing to decompose:\n  cost has a term that reads x\[2\], x\[7\]"):
+        hjb.decompose(problem, 10)
+
+
+def test_a_mere_bound_must_be_asked_for():
+    problem = hjb.avoid(
+        lambda x, u: u, hjb.Box([-1.0] * 2, [1.0] * 2), lambda x: jnp.maximum(jnp.abs(x[0]), jnp.abs(x[1])) - 0.5
+    )
+    with pytest.raises(ValueError, match="upper bound of V; pass bound=True"):
+        hjb.decompose(problem, 2)
+    assert hjb.decompose(problem, 2, bound=True).bound == "upper"
+
+
+@pytest.mark.slow
+def test_inputs_and_states_without_effect_keep_their_places():
+    """V = (√5 − 1)/2 (x₀² + x₁²) for x' = u; u₂ only costs, and x₂ has no effect."""
+    problem = hjb.Problem(
+        lambda x, u: jnp.append(u[:2], -x[2]), lambda x, u: x[0] ** 2 + x[1] ** 2 + u @ u,
+        hjb.Box([-3.0, -3.0, 0.5], [3.0] * 3), discount=1.0,
+    )  # fmt: skip
+    solution = hjb.decompose(problem, 3).solve(hjb.Grid([-1.0] * 3, [1.0] * 3, (41,) * 3))
+    x, p = np.array([0.3, -0.6, 0.9]), 0.6180339887
+    assert abs(solution.value_at(x) - p * (x[0] ** 2 + x[1] ** 2) - 0.25) < 2e-3
+    assert np.allclose(solution.control_at(x), [-p * x[0], -p * x[1], 0.5], atol=0.02)
+    assert np.allclose(solution.costate_at(x), [2 * p * x[0], 2 * p * x[1], 0], atol=0.02)
+    assert solution.ndim == 3
+
+
+def test_a_finite_set_stays_whole():
+    problem = hjb.Problem(
+        lambda x, u: -x + jnp.stack([u[0], 0 * u[0]]), lambda x, u: x @ x + u[0] ** 2,
+        hjb.Finite([[0.0, 0.0], [1.0, 1.0]]), discount=1.0,
+    )  # fmt: skip
+    found = hjb.decompose(problem, 2)
+    assert (found.states, found.controls) == (((0,), (1,)), ((0, 1), ()))
+    assert found.problems[0].controls.dim == 2
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -168,6 +168,109 @@ def test_the_derivative_is_the_costate_and_follows_parameters():
 
 
 @pytest.mark.slow
+def test_float32_states_have_float32_values_also_among_float64_numbers():
+    solution = hjb.hopf(free_motion(hjb.Ball(1.0, 3), hjb.convex.ball(np.zeros(3), 0.5)), 1.0, intervals=2)
+    with jax.enable_x64(True):
+        found = jax.jit(solution.value_at)(0.0, jnp.asarray([3.0, 0.0, 4.0], jnp.float32))
+    assert found.dtype == np.float32
+    assert abs(float(found) - 3.5) < 2e-3
+
+
+@pytest.mark.slow
+def test_derivatives_by_the_terminal_cost_and_of_the_control():
+    """x' = u, |u| ≤ 1: V = |x − c| − t − r, whose second derivative is that of the distance; u = −DV."""
+
+    def solution(radius, center):
+        problem = free_motion(hjb.Ball(1.0, 2), hjb.convex.ball(center, radius))
+        return hjb.hopf(problem, 1.0, intervals=4)
+
+    x, center = np.array([3.0, 0.5]), np.array([0.1, 0.2])
+    length = np.linalg.norm(x - center)
+    way = (x - center) / length
+    bent = (np.eye(2) - np.outer(way, way)) / length
+    with jax.enable_x64(True):
+        value = lambda radius, center, x: solution(radius, center).value_at(0.0, x)  # noqa: E731
+        by_radius, by_center = map(np.asarray, jax.grad(value, (0, 1))(0.5, jnp.asarray(center), jnp.asarray(x)))
+        hessian = jax.hessian(value, 2)(0.5, jnp.asarray(center), jnp.asarray(x))
+        turning = jax.jacfwd(lambda x: solution(0.5, center).control_at(0.0, x))(jnp.asarray(x))
+    assert abs(by_radius + 1) < 1e-6
+    assert np.allclose(by_center, -way, atol=1e-6)
+    assert np.allclose(hessian, bent, atol=1e-5)
+    assert np.allclose(turning, -bent, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_smooth_cost_may_close_over_a_parameter():
+    """x' = u, |u| ≤ 1: V(2) = k for J = k x² and T = 1, and V is linear in k."""
+
+    def value(k):
+        terminal = hjb.convex.smooth(lambda x: k * x @ x, 1)
+        return hjb.hopf(free_motion(hjb.Box([-1.0], [1.0]), terminal), 1.0, intervals=4).value_at(0.0, [2.0])
+
+    with jax.enable_x64(True):
+        assert np.allclose(jax.jit(jax.value_and_grad(value))(3.0), [3.0, 1.0], atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("terminal", [hjb.convex.ball([0.1, 0.2], 0.5), hjb.convex.box([-0.5] * 2, [0.5] * 2)])
+def test_near_the_horizon_the_value_is_the_terminal_cost(terminal):
+    """Where the control has hardly any effect, only rounding limits the bounds. V − J is at most T − t."""
+    solution = hjb.hopf(free_motion(hjb.Box([-1.0] * 2, [1.0] * 2), terminal), 1.0, intervals=4)
+    x = np.array([[3.0, 0.5], [0.1, 0.2], [0.5, 0.5], [0.0, 0.0], [1e6, 1.0]])
+    with jax.enable_x64(True):
+        exact = np.array([float(terminal(jnp.asarray(each))) for each in x])
+    for left in (0.0, 1e-12, 1e-6):
+        lower, upper = solution.bounds_at(1.0 - left, x)
+        assert np.all(
+            np.abs(solution.value_at(1.0 - left, x) - exact) <= 1.5 * left + 1e-13 * (1 + np.abs(x).max(axis=1))
+        )
+        assert np.all(upper - lower <= 1e-12 * (1 + 64 * np.abs(x).max(axis=1)))
+        assert np.all(upper >= exact - 1.5 * left - 1e-12 * (1 + 64 * np.abs(x).max(axis=1)))
+    with jax.enable_x64(True):
+        inside = [float(jax.jit(solution.value_at)(t, jnp.asarray(x[0]))) for t in (-0.5, 1.5, 1.0)]
+    assert np.isnan(inside).tolist() == [True, True, False]
+    assert abs(inside[2] - exact[0]) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("drift", "controls", "disturbances"),
+    [
+        # in the second state the disturbance opposes itself, in units 1e10 times larger than the first
+        (lambda x, u, d: jnp.stack([1e10 * (u[0] + d[0]), u[0] - 0.5 * d[0]]), hjb.Box([-1.0], [1.0]), ([-0.9], [0.9])),
+        # two disturbances that differ in size by 1e10, of which the second has no control against it
+        (
+            lambda x, u, d: jnp.stack([u[0] + d[0], 1e-10 * d[1]]), hjb.Box([-1.0], [1.0]),
+            ([-0.5, -1e10], [0.5, 1e10]),
+        ),
+    ],
+)  # fmt: skip
+def test_units_do_not_hide_a_disturbance(drift, controls, disturbances):
+    problem = hjb.reach(
+        drift, controls, hjb.convex.box([-1.0] * 2, [1.0] * 2), disturbances=hjb.Box(*disturbances), tube=False
+    )
+    with pytest.raises(ValueError, match="not known to be convex"):
+        hjb.hopf(problem, 1.0)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_ball_stretched_by_the_disturbance_is_not_a_smaller_ball(axis):
+    problem = hjb.reach(
+        lambda x, u, d: u + 1e-5 * d * jnp.eye(2)[axis], hjb.Ball(1.0, 2), hjb.convex.ball([0.0, 0.0], 0.5),
+        disturbances=hjb.Ball(5e4, 2), tube=False,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="not known to be convex"):
+        hjb.hopf(problem, 1.0)
+
+
+def test_a_saddle_in_large_units_is_not_convex():
+    problem = hjb.Problem(
+        lambda x, u: u, controls=hjb.Box([-1.0] * 2, [1.0] * 2), terminal_cost=lambda x: 1e10 * x[0] ** 2 - x[1] ** 2
+    )
+    with pytest.raises(ValueError, match="eigenvalues of both signs"):
+        hjb.hopf(problem, 1.0, states=2)
+
+
+@pytest.mark.slow
 def test_a_convex_quadratic_is_recognised_and_its_concave_twin_exchanges_the_players():
     problem = hjb.Problem(lambda x, u: u, controls=hjb.Box([-1.0], [1.0]), terminal_cost=lambda x: 3 * x @ x + x[0])
     # the minimum of 3y² + y over |y − x| ≤ 1 is −1/12 if y = −1/6 can be reached

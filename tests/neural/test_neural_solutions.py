@@ -157,6 +157,8 @@ def test_a_stochastic_value_in_closed_form(diffusion, tmp_path):
     found = diffusion.validation
     assert abs(found["value"] - exact) < 3 * found["standard_error"] + 2 * found["time_error"] + 0.01
     assert found["unexplained"] < 0.1
+    # u = −½ DV and noise ½: half of the largest −H_pp : σσᵀ = ½ : ¼, times the variance of Y
+    assert np.isclose(found["excess"], found["standard_error"] ** 2 * backward_equation.FRESH, rtol=1e-6)
     assert abs(diffusion.value_at(0.0, START) - found["value"]) < 1e-9
     near = START + 0.1 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     off = diffusion.value_at(0.0, near) - np.sum(near**2, axis=1) / 2 - 0.25 * 2 * np.log(2)
@@ -168,6 +170,38 @@ def test_a_stochastic_value_in_closed_form(diffusion, tmp_path):
     diffusion.save(tmp_path / "value")
     back = neural.NeuralSolution.load(tmp_path / "value", noisy())
     assert np.array_equal(back.control_at(0.5, x), diffusion.control_at(0.5, x))
+
+
+@pytest.mark.slow
+def test_the_excess_covers_a_feedback_that_is_not_optimal():
+    """Few time steps for a fast plant: V = x'Px + w, −P' = 1 + A'P + PA − PBB'P − βP, −w' = σ² tr P − βw."""
+    n, noise, horizon, discount = 8, 0.3, 0.8, 0.4
+    draw = np.random.default_rng(5)
+    a, b, x = draw.normal(size=(n, n)) / 4, draw.normal(size=(n, 3)), np.linspace(-0.5, 0.5, n)
+    problem = hjb.Problem(
+        lambda x, u: jnp.asarray(a) @ x + jnp.asarray(b) @ u, lambda x, u: x @ x + u @ u,
+        hjb.Box([-np.inf] * 3, [np.inf] * 3), noise=noise, discount=discount, terminal_cost=lambda x: 2 * x @ x,
+    )  # fmt: skip
+
+    def backward(left, row):
+        p = row[:-1].reshape(n, n)
+        change = np.eye(n) + a.T @ p + p @ a - p @ b @ b.T @ p - discount * p
+        return np.r_[change.ravel(), noise**2 * np.trace(p) - discount * row[-1]]
+
+    row = solve_ivp(backward, (0, horizon), np.r_[2 * np.eye(n).ravel(), 0.0], rtol=1e-9, atol=1e-11).y[:, -1]
+    exact = x @ row[:-1].reshape(n, n) @ x + row[-1]
+    found = neural.deep_bsde(problem, x, horizon, seed=3, steps=150, intervals=12, layers=(32,), rate=0.01).validation
+    assert found["value"] - exact > 2 * found["error"]
+    assert found["value"] - exact < found["error"] + found["excess"]
+    assert found["excess"] < 10 * (found["value"] - exact)
+
+
+@pytest.mark.parametrize(
+    ("bent", "noise", "ratio"),
+    [(np.diag([2.0, 0.0]), np.diag([0.5, 0.0]), 4.0), (np.diag([0.0, 1.0]), np.diag([0.5, 0.0]), np.inf)],
+)
+def test_noise_that_misses_a_curved_direction_gives_no_excess(bent, noise, ratio):
+    assert backward_equation._largest_ratio(bent, noise) == pytest.approx(ratio)
 
 
 def test_the_seed_repeats_it(diffusion):

@@ -1,4 +1,4 @@
-"""Problems with exact answers that are hard for error estimates: jumps, corners, layers, ends, small targets.
+"""Problems with exact answers that are hard for error estimates: jumps, corners, layers, ends, narrow features.
 
 Each is a problem on one grid. Its exact value is a NumPy function of states, shape (k, n) -> (k,).
 """
@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -539,6 +540,59 @@ def marches() -> list[Known]:
     ]  # fmt: skip
 
 
+def one_way(nodes: int, place: float, costs: tuple[float, float], speeds: tuple[float, float]) -> Known:
+    """x' = s > 0 until x = 1, discount ½; cost and speed jump at a fraction of the link up from the node near 0.1."""
+    jump, discount = 0.1 + place * 2 / (nodes - 1), 0.5
+
+    def exact(x: np.ndarray) -> np.ndarray:
+        first = np.maximum(jump - x[:, 0], 0) / speeds[0]
+        second = (1 - np.maximum(x[:, 0], jump)) / speeds[1]
+        late = costs[1] * -np.expm1(-discount * second) / discount
+        return costs[0] * -np.expm1(-discount * first) / discount + np.exp(-discount * first) * late
+
+    problem = hjb.Problem(
+        lambda x, u: jnp.where(x > jump, speeds[1], speeds[0]) + 0 * u,
+        lambda x, u: jnp.where(x[0] > jump, costs[1], costs[0]),
+        hjb.Box([-1.0], [1.0]),
+        discount=discount,
+        target=lambda x: 1 - x[0] - 1e-9,
+    )
+    return Known("cost jump", f"costs {costs}, speeds {speeds}, at {place}", problem, line(-1, 1, nodes), exact)
+
+
+def between_nodes(shape: tuple[int, ...], centre: tuple[float, ...], wind: float) -> Known:
+    """V = −2 Π cos 3(x − c) with |u| ≤ 1, discount 0.12: paths rest at minima of V, where L/β is lowest by far."""
+    speed, weight, discount, n = 1.7, 0.5, 0.12, len(shape)
+
+    def value(x: Any) -> Any:
+        return -2 * jnp.prod(jnp.cos(3 * (x - np.array(centre))))
+
+    def cost(x: Any, u: Any) -> Any:
+        slope = jax.grad(value)(x)
+        best = jnp.clip(-speed * slope / (2 * weight), -1, 1)
+        least = jnp.sum(speed * best * slope + weight * best**2)
+        return discount * value(x) - wind * jnp.cos(x) @ slope - least + weight * u @ u
+
+    problem = hjb.Problem(
+        lambda x, u: wind * jnp.cos(x) + speed * u, cost, hjb.Box([-1.0] * n, [1.0] * n), discount=discount
+    )
+    grid = hjb.Grid([0.0] * n, [2 * np.pi] * n, shape, periodic=(True,) * n)
+
+    def exact(x: np.ndarray) -> np.ndarray:
+        return -2 * np.prod(np.cos(3 * (x - np.array(centre))), axis=1)
+
+    return Known("rest", f"c = {centre}, wind {wind}", problem, grid, exact)
+
+
+def unresolved() -> list[Known]:
+    """Jumps of cost and speed, and narrow minima of the cost, between nodes."""
+    pairs = [((0.3, 2.0), (1.0, 1.0)), ((2.0, 0.3), (1.0, 1.0)), ((1.0, 1.0), (1.0, 2.0))]
+    found = [one_way(nodes, place, *pair) for pair in pairs for nodes in (41, 161) for place in (0.02, 0.6, 0.98)]
+    centres = [(0.03,), (0.05,), (0.079,)]
+    found += [between_nodes((nodes,), centre, wind) for centre in centres for nodes in (40, 80) for wind in (0.0, 0.3)]
+    return [*found, between_nodes((40, 36), (0.03, 0.05), 0.3)]
+
+
 def problems() -> list[Known]:
     """The problems of all groups."""
-    return [*jumps(), *corners(), *lost_targets(), *ends(), *two_nodes(), *others(), *marches()]
+    return [*jumps(), *corners(), *lost_targets(), *ends(), *two_nodes(), *others(), *unresolved(), *marches()]

@@ -133,36 +133,46 @@ def with_grid_error(solution: Solution, settled: Settled, coarser: CoarserAnswer
 
     Without a solution on a coarser grid ``stats["grid_error"]`` has the reason instead.
     """
+    value, task = np.asarray(solution.value), settled.task
     if coarser.grid is None or coarser.value is None:
         solution.stats["grid_error"] = coarser.reason
+        error = _between_nodes(solution, task, np.zeros_like(value))
+        warn_of_grid(error[None], value[None], said="")
         return solution
-    value, origin = np.asarray(solution.value), settled.origin
+    origin = settled.origin
     answers = grid_error.TwoGrids(
         solution.grid,
         coarser.grid,
         value,
         coarser.value,
-        held=np.broadcast_to(np.asarray(settled.task.obstacles.fixed), value.shape),
+        held=np.broadcast_to(np.asarray(task.obstacles.fixed), value.shape),
         chain=None if origin is None else np.asarray(origin.state.value),
         highest=_highest(settled),
     )
-    error = grid_error.estimate_error(answers)
-    error = np.maximum(error, value.dtype.type(error_at_rest(solution, settled.task, float(np.max(error)))))
-    missed = error_at_discontinuities(solution, settled.task)
-    error = error if missed is None else np.maximum(error, missed.astype(value.dtype))
+    error = _between_nodes(solution, task, grid_error.estimate_error(answers))
     error += _left(solution, settled, error)
     error[~np.isfinite(value)] = 0
     warn_of_grid(error[None], value[None])
     return dataclasses.replace(solution, grid_error=error)
 
 
-def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> None:
+def _between_nodes(solution: Solution, task: Task, error: np.ndarray) -> np.ndarray:
+    """An estimate of the error, at least that of rest points and discontinuities between the nodes, (*grid)."""
+    error = np.maximum(error, error.dtype.type(error_at_rest(solution, task, float(np.max(error)))))
+    missed = error_at_discontinuities(solution, task)
+    return error if missed is None else np.maximum(error, missed.astype(error.dtype))
+
+
+def warn_of_grid(
+    error: np.ndarray, value: np.ndarray, more: str = "nodes", said: str = " (Solution.grid_error)"
+) -> None:
     """Warn if the estimated error is above a tenth of the range of V at many nodes at some time.
 
     Args:
       error: the estimate, (k, *grid), with k = 1 for a stationary solution.
       value: V, (k, *grid); infinite values do not count.
       more: the quantities to increase for a smaller error.
+      said: where the solution has the estimate.
     """
     finite = np.isfinite(value)
     if not finite.any():
@@ -174,7 +184,7 @@ def warn_of_grid(error: np.ndarray, value: np.ndarray, more: str = "nodes") -> N
     if share > NODES:
         warn(
             f"the grid is coarse for this problem: its error is above a tenth of the range of V at {share:.0%} of the "
-            f"nodes (Solution.grid_error). Use more {more}, or concentrate nodes where V bends: Grid(..., stretch=)"
+            f"nodes{said}. Use more {more}, or concentrate nodes where V bends: Grid(..., stretch=)"
         )
 
 

@@ -137,3 +137,12 @@ def test_it_sees_a_narrow_minimum_in_the_plane(centre):
     error = np.abs(solution.value - jax.vmap(jax.vmap(exact))(grid.nodes()))
     assert error.max() > 0.2
     assert 1 / 3 < solution.grid_error.max() / error.max() < 3
+
+
+def test_it_warns_without_a_coarser_grid():
+    grid = hjb.Grid([0.0], [2 * np.pi], (10,), periodic=(True,))
+    exact, problem = manufactured(1, [0.2], 0.0, 2.0)
+    with pytest.warns(hjb.SolveWarning, match="the grid is coarse"):
+        solution = hjb.solve(problem, grid)
+    assert np.max(np.abs(solution.value - jax.vmap(exact)(grid.nodes()))) > 0.4
+    assert solution.grid_error is None

@@ -14,13 +14,11 @@ is solved on a grid that is small enough to factor, with the mean of its right-h
 """
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hjbjax.discretisation import stencil
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy
@@ -55,45 +53,53 @@ def error_at_discontinuities(solution: Solution, task: Task) -> np.ndarray | Non
 
 def _jumps(solution: Solution, task: Task, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mean error of the rate H on the moves from each node, per unit time, and its cost on one move, (*grid)."""
-    on, grid = task.on.chain, task.grid
-    u, d = (
-        [] if each is None else list(np.moveaxis(np.asarray(each), -1, 0))
-        for each in (solution.policy, solution.disturbance)
-    )
-    x = [np.asarray(each) for each in on.coordinates()]
-    slopes = [_slope(value, grid, axis) for axis in range(grid.ndim)]
-    obstacles = jax.device_get(task.obstacles)
+    grid, obstacles = task.grid, jax.device_get(task.obstacles)
+    # small programs compile fast: whatever is simple is computed here, and only the rates there
+    x = [np.reshape(np.asarray(grid.axis(axis), value.dtype), _along(grid, axis)) for axis in range(grid.ndim)]
     loose = np.broadcast_to(np.logical_not(obstacles.fixed), grid.shape)
-    total, moving = np.zeros(grid.shape, value.dtype), np.zeros(grid.shape, value.dtype)
-    for axis, step in itertools.product(grid.state_axes, (-1, 1)):
-        link = stencil.grid_links(grid, axis)
-        shift, unit = [np.zeros_like(each) for each in x], [0.0] * grid.ndim
-        shift[axis] = shift[axis] + step * np.asarray(link.up if step > 0 else link.down, value.dtype)
-        unit[axis] = float(step)
-        missed, rate = jax.device_get(_missed(on, x, shift, (u, d), (value, slopes), unit))
-        # beyond the boundary of a target nothing is paid, and a cost may be undefined there
-        total += np.where(_next_to(loose, grid, axis, step), missed, 0)
-        moving += rate
+    ways = [(axis, step) for axis in grid.state_axes for step in (-1, 1)]
+    # beyond the boundary of a target nothing is paid, and a cost may be undefined there
+    free = np.stack([_next_to(loose, grid, axis, step) for axis, step in ways])
+    signs = np.array([[step * (i == axis) for i in range(grid.ndim)] for axis, step in ways], value.dtype)
+    shifts = [
+        np.stack([_step(grid, axis, sign[axis]) for sign in signs]).astype(value.dtype) for axis in range(grid.ndim)
+    ]
+    actions = tuple(None if each is None else np.asarray(each) for each in (solution.policy, solution.disturbance))
+    total, moving = jax.device_get(_missed(task.on.chain, x, actions, value, (shifts, signs, free)))
     moves = np.asarray(obstacles.acting(value)) & (moving > 0)
     source = np.divide(total, moving, out=np.zeros_like(total), where=moves)
     return source, np.divide(source, moving, out=np.zeros_like(total), where=moves)
 
 
 @jax.jit
-def _missed(
-    on: Discretisation, x: list, shift: list, actions: tuple[list, list], around: tuple[Field, list], unit: list
-) -> tuple[Field, Field]:
-    """The rate of moves in one direction times the error of H on them, and this rate, (*grid).
+def _missed(on: Discretisation, x: list, actions: tuple, value: Field, ways: tuple) -> tuple[Field, Field]:
+    """The sum over all directions of the rate of moves times the error of H on them, and of the rates, (*grid).
 
     Args:
       on: the problem on its grid.
       x: the coordinates of the nodes.
-      shift: the way to the neighbour, one entry per axis.
-      actions: u and d.
-      around: V and its slope along every axis.
-      unit: ±1 for the axis of the neighbour, 0 for the others.
+      actions: u and d, (*grid, m).
+      value: V.
+      ways: for every direction the way to the neighbour, one array per axis; the direction as a unit vector; and the
+        nodes whose neighbour is free.
     """
-    (u, d), (value, slopes) = actions, around
+    actions = tuple([] if each is None else list(jnp.moveaxis(each, -1, 0)) for each in actions)
+    around = (value, [_slope(value, on.grid, x[axis], axis) for axis in range(on.grid.ndim)])
+
+    def add(sums: tuple[Field, Field], way: tuple[list, jax.Array, Field]) -> tuple[tuple[Field, Field], None]:
+        shift, sign, free = way
+        missed, rate = _missed_on(on, x, actions, around, (shift, list(sign)))
+        return (sums[0] + jnp.where(free, missed, 0), sums[1] + rate), None
+
+    zero = jnp.zeros(on.grid.shape, on.dtype)
+    return jax.lax.scan(add, (zero, zero), ways)[0]
+
+
+def _missed_on(
+    on: Discretisation, x: list, actions: tuple[list, list], around: tuple[Field, list], way: tuple[list, list]
+) -> tuple[Field, Field]:
+    """The rate of moves in one direction times the error of H on them, and this rate, (*grid)."""
+    (u, d), (value, slopes), (shift, sign) = actions, around, way
 
     def rate_at(share: float) -> tuple[Field, Field]:
         """H at x + share (y − x), and the drift towards y."""
@@ -101,35 +107,53 @@ def _missed(
         f, growth = on.drift(u, d, z), on.growth(u, d, z)
         paid = on.running_cost(u, d, z) + sum(each * value for each in growth)
         gain = sum(rate * slope for rate, slope in zip(f, slopes, strict=True))
-        return paid + gain, sum(rate * sign for rate, sign in zip(f, unit, strict=True))
+        return paid + gain, sum(rate * step for rate, step in zip(f, sign, strict=True))
 
     (behind, _), (here, f), (middle, _), (there, beyond) = (rate_at(share) for share in (-1, 0, 0.5, 1))
     jump = jnp.abs(here - 2 * middle + there)
     near = jnp.abs(middle - here) > jnp.abs(there - middle)
     jump = jnp.where(jump > SMOOTH * jnp.abs(behind - 2 * here + there), jump, 0) * jnp.where(near, 1, 0.5)
     length, noise = sum(jnp.abs(step) for step in shift), on.diffusion(u, d)
-    rate = jnp.maximum(f, 0) / length + sum(unit[i] ** 2 * a for (i, j), a in noise.items() if i == j) / (2 * length**2)
+    rate = jnp.maximum(f, 0) / length + sum(sign[i] ** 2 * a for (i, j), a in noise.items() if i == j) / (2 * length**2)
     # without noise, a path that comes to rest between x and y does not get to y
     counts = jnp.isfinite(jump) & ((jnp.abs(f) > jnp.abs(beyond - f)) | (on.problem.noise is not None))
-    shape = on.grid.shape
-    return jnp.broadcast_to(jnp.where(counts, rate * jump, 0), shape), jnp.broadcast_to(rate, shape)
+    return jnp.where(counts, rate * jump, 0), rate
+
+
+def _along(grid: Grid, axis: int) -> list[int]:
+    """The shape of an array that varies along one axis only."""
+    return [-1 if i == axis else 1 for i in range(grid.ndim)]
+
+
+def _step(grid: Grid, axis: int, sign: float) -> np.ndarray:
+    """The way to the next node along an axis, up or down, or zero; one number per node of the axis."""
+    nodes = np.asarray(grid.axis(axis))
+    if grid.periodic[axis]:
+        return np.reshape(np.full(nodes.shape, sign * float(grid.spacing(axis))), _along(grid, axis))
+    gaps = np.diff(nodes)
+    gaps = np.append(gaps, gaps[-1:]) if sign > 0 else np.append(gaps[:1], gaps)
+    return np.reshape(sign * gaps, _along(grid, axis))
 
 
 def _next_to(nodes: np.ndarray, grid: Grid, axis: int, step: int) -> np.ndarray:
-    """True where the neighbour is one of the nodes, bool (*grid)."""
+    """True where the neighbour in one direction exists and is one of the nodes, bool (*grid)."""
     found = np.roll(nodes, -step, axis)
     if not grid.periodic[axis]:
         found[(slice(None),) * axis + (-1 if step > 0 else 0,)] = False
     return found
 
 
-def _slope(value: np.ndarray, grid: Grid, axis: int) -> np.ndarray:
+def _slope(value: Field, grid: Grid, x: Field, axis: int) -> Field:
     """The slope of V along an axis by central differences, one-sided at the ends of the box."""
     if axis not in grid.state_axes:
-        return np.zeros_like(value)
-    if not grid.periodic[axis]:
-        return np.gradient(value, np.asarray(grid.axis(axis)), axis=axis)
-    return (np.roll(value, -1, axis) - np.roll(value, 1, axis)) / (2 * float(grid.spacing(axis)))
+        return jnp.zeros_like(value)
+    if grid.periodic[axis]:
+        return (jnp.roll(value, -1, axis) - jnp.roll(value, 1, axis)) / (
+            2 * jnp.asarray(grid.spacing(axis), value.dtype)
+        )
+    ahead, behind = (np.clip(np.arange(grid.shape[axis]) + step, 0, grid.shape[axis] - 1) for step in (1, -1))
+    width = jnp.take(x, ahead, axis) - jnp.take(x, behind, axis)
+    return (jnp.take(value, ahead, axis) - jnp.take(value, behind, axis)) / width
 
 
 def _along_paths(level: Task, value: np.ndarray, source: np.ndarray, fine: Grid) -> np.ndarray | None:

@@ -102,10 +102,10 @@ def _promising_links(about: _Value, least: float) -> list[tuple[np.ndarray, int]
 def _bends_along(about: _Value, axis: int) -> np.ndarray:
     """The second difference of L on the link from each node to the next along an axis, (*grid); −∞ where it is none."""
     grid = about.grid
-    x = [np.asarray(each) for each in grid.components(about.value.dtype)]
+    nodes = (np.asarray(grid.axis(i), about.value.dtype) for i in range(grid.ndim))
+    x = [np.reshape(each, [-1 if i == k else 1 for i in range(grid.ndim)]) for k, each in enumerate(nodes)]
     shift = [np.zeros_like(each) for each in x]
-    lengths = _lengths(grid, axis)
-    shift[axis] = np.reshape(lengths, [-1 if i == axis else 1 for i in range(grid.ndim)]).astype(x[axis].dtype)
+    shift[axis] = np.reshape(_lengths(grid, axis), x[axis].shape).astype(x[axis].dtype)
     u = list(np.moveaxis(about.policy.reshape(*grid.shape, -1), -1, 0))
     bends = np.array(_bends(about.problem, x, shift, u))
     last = (slice(None),) * axis + (-1,)

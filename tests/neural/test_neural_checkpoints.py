@@ -210,6 +210,9 @@ def test_the_file_of_another_training_is_refused(door, tmp_path, monkeypatch):
             door(**{word: value}, checkpoint=path, resume=True)
     with pytest.raises(FileExistsError, match="there is a checkpoint already"):
         door(checkpoint=path)
+    used = open_checkpoint(tmp_path / "used.npz", [plant()], 2, resume=False, caller="other")
+    with used, pytest.raises(hjb.FileError, match="another run is using it"):
+        door(checkpoint=tmp_path / "used.npz", resume=True)
     with pytest.raises(hjb.FileError, match="cannot"):
         door(checkpoint=tmp_path / "missing" / "run.npz")
     with pytest.raises(Begun):  # not a part of the training

@@ -110,7 +110,7 @@ def find_blocks(problem: Problem, n: int, *, bound: bool) -> Blocks:
       bound: True if subsystems may share inputs, so that the result may be a bound of V.
 
     Raises:
-      ValueError: the problem does not fall apart; the message names the coupling.
+      ValueError: the problem does not separate; the message names the coupling.
     """
     _check_ingredients(problem)
     m, k = (0 if each is None else each.dim for each in (problem.controls, problem.disturbances))
@@ -263,7 +263,7 @@ def _common(problem: Problem, names: Names) -> list[Inputs]:
 
 
 def _joined_groups(groups: Sequence[Group], common: Sequence[Inputs], *, share: bool) -> list[Group]:
-    """Groups joined if they share inputs, unless they may, or use inputs that a set couples."""
+    """Join the groups that share inputs, unless ``share`` allows this, and the groups whose inputs a set couples."""
     found: list[Group] = []
     for inputs, keys in groups:
         inputs = inputs.union(*(each for each in common if inputs & each))
@@ -316,7 +316,7 @@ def _block(inputs: Inputs, keys: frozenset[Inputs], names: Names) -> Block:
 
 
 def _coupling(problem: Problem, reads: Sequence[Inputs], found: dict[str, Separated], names: Names, bound: bool) -> str:
-    """The message about a problem that does not fall apart."""
+    """The message about a problem that does not separate."""
     couplings: list[tuple[str, Inputs]] = []  # in words, and the inputs that are coupled
     for i, each in enumerate(reads):
         others = frozenset(j for j in each if j < names.n and j != i)

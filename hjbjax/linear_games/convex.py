@@ -139,7 +139,7 @@ class Quadratic(_WithoutBarrier):
 
 
 @pytree_dataclass(static=("dim",))
-class Smooth(_WithoutBarrier):
+class Differentiable(_WithoutBarrier):
     """A differentiable function that its user declares convex; made by ``smooth``.
 
     Args:
@@ -195,7 +195,7 @@ class Conjugated(_WithoutBarrier):
         return jax.hessian(lambda p: jnp.asarray(self.transform(p), theta.dtype))(theta)
 
 
-ConvexFunction: TypeAlias = Largest | Quadratic | Smooth | Conjugated
+ConvexFunction: TypeAlias = Largest | Quadratic | Differentiable | Conjugated
 
 
 def ball(center: Numbers | Sequence, radius: Number) -> Largest:
@@ -293,7 +293,7 @@ def largest(functions: Sequence[Largest]) -> Largest:
     )
 
 
-def smooth(function: Callable, states: int, *, conjugate: Callable | None = None) -> Smooth | Conjugated:
+def smooth(function: Callable, states: int, *, conjugate: Callable | None = None) -> Differentiable | Conjugated:
     """Declare that a function is convex, and differentiable unless its Legendre transform is given.
 
     The bounds of ``hopf`` are wrong if the declaration is.
@@ -312,7 +312,7 @@ def smooth(function: Callable, states: int, *, conjugate: Callable | None = None
     n = arguments.count(states, "convex.smooth: states")
     own = _settled(function, n, "convex.smooth: function")
     if conjugate is None:
-        return Smooth(n, own)
+        return Differentiable(n, own)
     found = Conjugated(n, own, _settled(conjugate, n, "convex.smooth: conjugate"))
     if not is_traced(found):
         _check_transform(found)

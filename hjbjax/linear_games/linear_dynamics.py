@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.applications.reachability import depth
-from hjbjax.linear_games.convex import Conjugated, ConvexFunction, Largest, Quadratic, Smooth
+from hjbjax.linear_games.convex import Conjugated, ConvexFunction, Differentiable, Largest, Quadratic
 from hjbjax.linear_games.support import reduced
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import is_traced, pytree_dataclass
@@ -160,7 +160,7 @@ def _semidefinite(matrix: np.ndarray) -> bool:
 def _of_module(function: Any) -> ConvexFunction | None:
     """The function of ``convex`` that a problem holds as a ``Partial``; None for another function."""
     while isinstance(function, jax.tree_util.Partial) and len(function.args) == 1 and not function.keywords:
-        if isinstance(function.args[0], (Largest, Quadratic, Smooth, Conjugated)):
+        if isinstance(function.args[0], (Largest, Quadratic, Differentiable, Conjugated)):
             return function.args[0]
         function = function.args[0]
     return None

@@ -35,14 +35,16 @@ from hjbjax.hamiltonian.pointwise import Rule
 from hjbjax.neural import ingredients
 from hjbjax.neural.ansatz import HorizonAnsatz, terminal_cost
 from hjbjax.neural.network import checked_layers, initial_weights
-from hjbjax.neural.solution import NeuralSolution, weights_of_guess
+from hjbjax.neural.solution import NeuralSolution, numbers_of_guess, weights_of_guess
 from hjbjax.neural.training import Training, train
 from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Control, Key, Number, State
+from hjbjax.solution.checkpoints import Checkpoint, open_checkpoint
 from hjbjax.solution.clock import CUT, Clock, noting_interrupts
+from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status
 from hjbjax.tracing.dependence import influence
@@ -114,6 +116,8 @@ def deep_bsde(
     rate: float = 3e-3,
     tol: float = 0.01,
     guess: NeuralSolution | None = None,
+    checkpoint: Path | Checkpoint | None = None,
+    resume: bool = False,
     time_limit: float | None = None,
     progress: bool | None = None,
 ) -> NeuralSolution:
@@ -136,6 +140,10 @@ def deep_bsde(
       tol: for CONVERGED, ``error``, ``near_error`` and a finite ``excess`` must be at most this fraction of the value,
         or of the spread of the cost if that is larger, and ``unexplained`` at most 0.1.
       guess: a NeuralSolution of the same problem, from whose weights the training starts.
+      checkpoint: a file for the state of the training, written every minute and at the end, or
+        ``Checkpoint(path, every=)``.
+      resume: continue from that file if it exists, with the same bits. All arguments except ``tol``, ``time_limit`` and
+        ``progress`` must be the same.
       time_limit: seconds, including compilation.
       progress: show a bar of the steps after a second; ``None``: on a terminal.
 
@@ -152,16 +160,23 @@ def deep_bsde(
 
     Raises:
       ValueError: an ingredient of the problem that is not supported, or an argument that is not admissible.
+      FileExistsError: the checkpoint exists, without ``resume``.
+      FileError: the checkpoint belongs to another problem or other arguments, is in use by another run, or cannot be
+        written.
       SolveError: Ctrl-C or the time limit before the first step was complete.
     """
     start = ingredients.state(x0, f"{NAME}: x0")
     horizon = float(arguments.positive(horizon, f"{NAME}: horizon", "in units of time"))
-    arguments.positive(rate, f"{NAME}: rate")
+    rate = float(arguments.positive(rate, f"{NAME}: rate"))
     arguments.positive(tol, f"{NAME}: tol")
     counts = [arguments.count(each, f"{NAME}: {name}") for each, name in ((intervals, "intervals"), (steps, "steps"))]
     batch = arguments.count(batch, f"{NAME}: batch", least=2)
     widths, seed = checked_layers(layers, NAME), ingredients.known_seed(seed, NAME)
     clock = Clock(seconds=time_limit, progress=progress)
+    asked: Any = {
+        "x0": start, "horizon": horizon, "seed": seed, "intervals": counts[0], "steps": counts[1], "batch": batch,
+        "layers": widths, "rate": rate, "guess": numbers_of_guess(guess),
+    }  # fmt: skip
     with noting_interrupts(clock), own_settings(x64=True):
         settled, rule = ingredients.settled_problem(
             problem, len(start), NAME, {"target": "paths that end on a target have no common horizon"}
@@ -169,11 +184,13 @@ def deep_bsde(
         if settled.noise is None or not influence(settled, len(start), np.dtype(np.float64)).noise.is_constant:
             raise ValueError(f"{NAME}: wanted a problem with noise that does not depend on the control")
         plant = Plant(settled, jnp.asarray(start), horizon, rule)
-        ansatz = _first_ansatz(plant, counts[0], seed, widths)
-        if guess is not None:
-            weights_of_guess(guess, len(start) + 2, widths, NAME)
-            ansatz = dataclasses.replace(guess.ansatz, horizon=horizon)
-        found = _trained(plant, ansatz, counts, batch, rate, seed, clock)
+        with open_checkpoint(checkpoint, [settled], len(start), resume=resume, caller=NAME, **asked) as file:
+            clock.journal = file and file.journal()
+            ansatz = _first_ansatz(plant, counts[0], seed, widths)
+            if guess is not None:
+                weights_of_guess(guess, len(start) + 2, widths, NAME)
+                ansatz = dataclasses.replace(guess.ansatz, horizon=horizon)
+            found = _trained(plant, ansatz, counts, batch, rate, seed, clock)
         if found.status in CUT and not found.history:
             raise SolveError(f"{NAME}: {found.status}, before the first step was complete")
         return _report(plant, dataclasses.replace(ansatz, weights=found.weights), found, counts[0], seed, tol, clock)
@@ -228,7 +245,7 @@ def _trained(
     def loss(weights: Any, key: Key, data: Any) -> jax.Array:
         return mean_square(weights, jax.random.split(key, batch))
 
-    return train(loss, measure, ansatz.weights, None, steps=steps, rate=rate, seed=seed, clock=clock)
+    return train(loss, measure, ansatz.weights, steps=steps, rate=rate, seed=seed, clock=clock)
 
 
 def _path_loss(plant: Plant, ansatz: HorizonAnsatz, intervals: int, key: Key) -> jax.Array:

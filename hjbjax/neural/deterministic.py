@@ -27,14 +27,16 @@ from hjbjax.neural import ingredients, riccati
 from hjbjax.neural.ansatz import HorizonAnsatz, RestAnsatz, TargetAnsatz, norm_of, target_level, terminal_cost
 from hjbjax.neural.extremal_samples import TOL, ExtremalSamples
 from hjbjax.neural.network import checked_layers, initial_weights
-from hjbjax.neural.solution import NeuralSolution, value_of, weights_of_guess
+from hjbjax.neural.solution import NeuralSolution, numbers_of_guess, value_of, weights_of_guess
 from hjbjax.neural.training import CHUNK, Training, train
 from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import cast, front_door, pytree_dataclass
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Key, Number, State
+from hjbjax.solution.checkpoints import Checkpoint, open_checkpoint
 from hjbjax.solution.clock import CUT, Clock, noting_interrupts
+from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status
 
@@ -117,6 +119,8 @@ def solve(
     rate: float = 0.01,
     tol: float = 0.02,
     guess: NeuralSolution | None = None,
+    checkpoint: Path | Checkpoint | None = None,
+    resume: bool = False,
     time_limit: float | None = None,
     progress: bool | None = None,
 ) -> NeuralSolution:
@@ -146,6 +150,10 @@ def solve(
       rate: the initial rate of Adam, which falls to zero over the steps.
       tol: for CONVERGED, the errors of value and costs must be at most tol; without held-out extremals the residual.
       guess: a NeuralSolution of the same problem and box, from whose weights the training starts.
+      checkpoint: a file for the state of the training, written every minute and at the end, or
+        ``Checkpoint(path, every=)``.
+      resume: continue from that file if it exists, with the same bits. All arguments except ``tol``, ``time_limit`` and
+        ``progress`` must be the same.
       time_limit: seconds, including compilation.
       progress: show a bar of the steps after a second; ``None``: on a terminal.
 
@@ -158,30 +166,39 @@ def solve(
     Raises:
       ValueError: an ingredient of the problem that is not supported, no rest point, or an argument that is not
         admissible.
+      FileExistsError: the checkpoint exists, without ``resume``.
+      FileError: the checkpoint belongs to another problem or other arguments, is in use by another run, or cannot be
+        written.
       SolveError: Ctrl-C or the time limit before the training began.
     """
     corners = ingredients.box_corners(lo, hi, NAME)
     counts = [arguments.count(each, f"{NAME}: {name}") for each, name in ((steps, "steps"), (batch, "batch"))]
     for number, name in ((extremals, "extremals"), (held_out, "held_out")):
         arguments.count(number, f"{NAME}: {name}", least=0)
-    arguments.positive(rate, f"{NAME}: rate")
+    rate = float(arguments.positive(rate, f"{NAME}: rate"))
+    if horizon is not None:
+        horizon = float(arguments.positive(horizon, f"{NAME}: horizon", "in units of time"))
     arguments.positive(tol, f"{NAME}: tol")
     widths, seed = checked_layers(layers, NAME), ingredients.known_seed(seed, NAME)
-    clock, draw, n = Clock(seconds=time_limit, progress=progress), np.random.default_rng(seed), len(corners[0])
+    clock, n = Clock(seconds=time_limit, progress=progress), len(corners[0])
+    asked: Any = {
+        "lo": corners[0], "hi": corners[1], "seed": seed, "horizon": horizon,
+        "rest": None if rest is None else np.asarray(rest).tolist(), "quadratic": bool(quadratic),
+        "extremals": int(extremals), "held_out": int(held_out), "steps": counts[0], "batch": counts[1],
+        "layers": widths, "rate": rate, "guess": numbers_of_guess(guess),
+    }  # fmt: skip
     with noting_interrupts(clock), own_settings(x64=True):
         settled, rule = ingredients.settled_problem(problem, n, NAME, {"noise": "see deep_bsde"})
         assert rule is not None
         equation = Equation(settled, jnp.asarray(corners[0]), jnp.asarray(corners[1]), 0.0, 0.0, rule)
-        equation, ansatz, options = _begun(equation, horizon, rest, quadratic, seed, widths)
-        if guess is not None:
-            begun = weights_of_guess(guess, np.shape(ansatz.weights[0][0])[0], widths, NAME)
-            ansatz = dataclasses.replace(ansatz, weights=begun)
-        choosing = min(CHOOSING, held_out // 2)
-        sizes = (extremals, choosing, held_out - choosing)
-        seen, chosen, unseen = (ExtremalSamples(*corners, size, options) for size in sizes)
-        for held in (unseen, chosen):
-            held.collect(settled, draw.uniform(*corners, (2 * held.capacity, n)), clock)
-        found = _trained(equation, ansatz, (seen, chosen), counts, rate, seed, clock)
+        with open_checkpoint(checkpoint, [settled], n, resume=resume, caller=NAME, **asked) as file:
+            clock.journal = file and file.journal()
+            equation, ansatz, options = _begun(equation, horizon, rest, quadratic, seed, widths)
+            if guess is not None:
+                begun = weights_of_guess(guess, np.shape(ansatz.weights[0][0])[0], widths, NAME)
+                ansatz = dataclasses.replace(ansatz, weights=begun)
+            seen, chosen, unseen = _samples(settled, corners, options, (extremals, held_out), seed, clock)
+            found = _trained(equation, ansatz, (seen, chosen), counts, rate, seed, clock)
         if found.status in CUT and not found.history:
             raise SolveError(f"{NAME}: {found.status}, before the training began")
         ansatz = jax.tree.map(np.asarray, dataclasses.replace(ansatz, weights=found.weights))
@@ -195,6 +212,24 @@ def solve(
         return dataclasses.replace(
             solution, code=int(status), validation=validation, history=np.array(found.history), seconds=clock.elapsed()
         )
+
+
+def _samples(
+    problem: Problem,
+    corners: tuple[np.ndarray, np.ndarray],
+    options: dict[str, Any],
+    counts: tuple[int, int],
+    seed: int,
+    clock: Clock,
+) -> tuple[ExtremalSamples, ExtremalSamples, ExtremalSamples]:
+    """Empty samples for the training, and the held-out ones that choose the best weights and that validate."""
+    extremals, held_out = counts
+    choosing, draw = min(CHOOSING, held_out // 2), np.random.default_rng(seed)
+    sizes = (extremals, choosing, held_out - choosing)
+    seen, chosen, unseen = (ExtremalSamples(*corners, size, options) for size in sizes)
+    for held in (unseen, chosen):
+        held.collect_all(problem, draw.uniform(*corners, (2 * held.capacity, len(corners[0]))), clock)
+    return seen, chosen, unseen
 
 
 def _begun(
@@ -213,8 +248,7 @@ def _begun(
         weights = initial_weights(seed, n, widths, bias=0.0 if quadratic else BIAS)
         equation, at_rest = _at_rest(equation, rest, quadratic, weights)
         return equation, at_rest, {"rest": at_rest.state}
-    duration = float(arguments.positive(horizon, f"{NAME}: horizon", "in units of time"))
-    return *_over_horizon(equation, duration, quadratic, initial_weights(seed, n + 2, widths)), {"horizon": duration}
+    return *_over_horizon(equation, horizon, quadratic, initial_weights(seed, n + 2, widths)), {"horizon": horizon}
 
 
 def _to_target(equation: Equation, weights: Any) -> tuple[Equation, TargetAnsatz]:
@@ -368,22 +402,21 @@ def _trained(
     if pure:  # the Riccati equation alone has up to 2ⁿ solutions: compute all extremals before the residual counts
         rounds = {0: seen.capacity}
 
-    def refresh(weights: Any, number: int, data: Any) -> Any:
+    def refresh(weights: Any, number: int, keep: Callable) -> Any:
         if (share := rounds.get(number, 0)) and len(seen.starts) < seen.capacity:
             places = equation.places(jax.random.key(seed + 2 + number), CANDIDATES * share)
             # at the start of a pure network the residual only measures the distance to the rest point
             large = np.zeros(share * CANDIDATES) if pure else np.abs(_relative_residuals(equation, of(weights), places))
             worst = np.argmax(large.reshape(share, CANDIDATES), axis=1)
             starts = np.asarray(places[1]).reshape(share, CANDIDATES, -1)[np.arange(share), worst]
-            seen.collect(equation.problem, starts, clock)
-            data = seen.arrays()
+            earlier = sum(size for begun, size in rounds.items() if begun < number)
+            seen.collect(equation.problem, starts, clock, earlier=earlier, keep=keep)
         # the equation has other solutions, also negative ones; begin with the extremals, which are near the value
         weight = min(1.0, number / (WARM * chunks)) if seen.count else 1.0
-        return data | {"share": jnp.asarray(weight)}
+        return seen.arrays() | {"share": jnp.asarray(weight)}
 
-    begun = seen.arrays() | {"share": jnp.asarray(1.0)}
     return train(
-        loss, measure, ansatz.weights, begun, steps=steps, rate=rate, seed=seed, clock=clock, enough=ENOUGH,
+        loss, measure, ansatz.weights, steps=steps, rate=rate, seed=seed, clock=clock, enough=ENOUGH, samples=seen,
         refresh=refresh,
     )  # fmt: skip
 

@@ -238,6 +238,13 @@ def weights_of_guess(guess: object, inputs: int, layers: Sequence[int], name: st
     return weights
 
 
+def numbers_of_guess(guess: object) -> np.ndarray | None:
+    """All numbers of the ansatz of a guess, as its identity in a checkpoint; None without a guess."""
+    if not isinstance(guess, NeuralSolution):
+        return None
+    return np.concatenate([np.ravel(np.asarray(leaf, np.float64)) for leaf in jax.tree.leaves(guess.ansatz)])
+
+
 def value_of(solution: NeuralSolution, t: Number, x: State) -> Scalar:
     """V at one state."""
     return solution.ansatz(solution.problem, t, x)

@@ -290,7 +290,7 @@ def versions() -> dict[str, str]:
 def open_checkpoint(
     checkpoint: Path | Checkpoint | None,
     problems: Sequence[Problem],
-    grid: Grid,
+    grid: Grid | int,
     *,
     resume: bool,
     caller: str,
@@ -305,7 +305,7 @@ def open_checkpoint(
     Args:
       checkpoint: the file, or a ``Checkpoint``.
       problems: one problem, or the problems of all lanes.
-      grid: the grid.
+      grid: the grid; without one the number of states.
       resume: continue from the file, if it exists.
       caller: the function that was called, for messages.
       together: True if several processes solve the problem.
@@ -426,20 +426,20 @@ def _in_all_processes(path: str) -> Iterator[None]:
         raise kind(f"{path}: another process of this run could not open it")
 
 
-def describe_question(problems: Sequence[Problem], grid: Grid, **others: Any) -> dict[str, str]:
+def describe_question(problems: Sequence[Problem], grid: Grid | int, **others: Any) -> dict[str, str]:
     """The question of a run by parts, as text: digests of its problems, its grid, and its other arguments."""
-    about = (
-        grid.shape,
-        grid.periodic,
-        grid.edges,
-        [each and (each.strength, each.center) for each in grid.stretch],
-    )
-    ends = np.concatenate([np.asarray(grid.lo, np.float64), np.asarray(grid.hi, np.float64)])
-    digests = " ".join(closures.digest(problem, grid.ndim) for problem in problems)
-    found = {
-        "problem" if len(problems) == 1 else "list of problems": digests,
-        "grid": f"{about} from {ends.tobytes().hex()}",
-    }
+    n = grid.ndim if isinstance(grid, Grid) else grid
+    digests = " ".join(closures.digest(problem, n) for problem in problems)
+    found = {"problem" if len(problems) == 1 else "list of problems": digests}
+    if isinstance(grid, Grid):
+        about = (
+            grid.shape,
+            grid.periodic,
+            grid.edges,
+            [each and (each.strength, each.center) for each in grid.stretch],
+        )
+        ends = np.concatenate([np.asarray(grid.lo, np.float64), np.asarray(grid.hi, np.float64)])
+        found["grid"] = f"{about} from {ends.tobytes().hex()}"
     for word, thing in others.items():
         array = isinstance(thing, (np.ndarray, jax.Array))
         said = hashlib.blake2b(np.asarray(thing).tobytes(), digest_size=16).hexdigest() if array else repr(thing)

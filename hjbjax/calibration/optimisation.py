@@ -92,6 +92,8 @@ class Fit(files.Saved):
     def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
         """The result with the header and the arrays of a file."""
         found = {name: arrays[f"parameter{i}"] for i, name in enumerate(header["names"])}
+        if not all(isinstance(name, str) for name in found):
+            raise files.FileError(f"its names of parameters are {list(found)}, wanted text")
         error = header["gradient_error"]
         return cls(
             found, float(header["loss"]), arrays["history"], Status(header["status"]),

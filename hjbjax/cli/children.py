@@ -115,9 +115,11 @@ def followed(module: str, words: Sequence[str], environment: Mapping[str, str]) 
     """The command ``python -m module words`` in a process that ends when its launcher ends, even by ``kill -9``.
 
     It imports from the same folders as the launcher, so a file ``random.py`` in the working directory has no effect.
+    Under PYTHONINSPECT it would end in a prompt, with exit code 1 in any case, so it does not inherit this variable.
     """
     path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
-    return Command([sys.executable, "-P", __file__, module, *words], {**environment, "PYTHONPATH": path})
+    inherited = {name: value for name, value in environment.items() if name != "PYTHONINSPECT"}
+    return Command([sys.executable, "-P", __file__, module, *words], {**inherited, "PYTHONPATH": path})
 
 
 def run_children(

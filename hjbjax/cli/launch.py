@@ -8,6 +8,7 @@ writes it. ``hjbjax.cli.children`` starts and ends the processes and reports how
 import contextlib
 import dataclasses
 import difflib
+import errno
 import math
 import os
 import shlex
@@ -16,7 +17,7 @@ import socket
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hjbjax.cli import children
 from hjbjax.cli.command_line import Failure, finite, starting_jax
@@ -158,9 +159,10 @@ def _join(this: Member) -> None:
     """Meet the other processes of a launch."""
     import jax
 
+    address = _address_of(this.coordinator)
     try:
         if this.rank == 0:
-            _check_port(this.coordinator)  # JAX's own error does not name the port
+            _check_port(*address)  # JAX's own error does not name the port
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         # JAX's handler of SIGTERM would swallow a request to end that comes before the solve
         jax.config.update("jax_enable_preemption_service", False)
@@ -176,15 +178,38 @@ def _join(this: Member) -> None:
         why = getattr(error, "strerror", None) or error
         raise Failure(
             f"process {this.rank} of {this.processes} could not meet the others at {this.coordinator}: {why}; "
-            "another program may use the port: start the command again"
+            f"{_WITHOUT_ADDRESS.get(getattr(error, 'errno', 0), _TAKEN)}"
         ) from error
 
 
-def _check_port(coordinator: str) -> None:
-    """Raise OSError if the port of the coordinator is not available."""
+_TAKEN = "another program may use the port: start the command again"
+_WITHOUT_ADDRESS = {  # advice if process 0 cannot have the address, by the error of the system
+    errno.EADDRNOTAVAIL: f"process 0 must run on the host in {COORDINATOR}",
+    errno.EACCES: f"choose another port in {COORDINATOR}",
+}
+
+
+def _address_of(coordinator: str) -> tuple[socket.AddressFamily, Any]:
+    """The family and the address of the coordinator's socket.
+
+    Raises:
+      Failure: the name of its host cannot be resolved, for which JAX would wait for five minutes.
+    """
     host, _, port = coordinator.rpartition(":")
-    with _shared_socket() as probe:
-        probe.bind((host, int(port)))
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)  # brackets: an IPv6 address
+    except (OSError, UnicodeError) as error:  # UnicodeError: an empty label, or one that is too long
+        why = getattr(error, "strerror", None) or error
+        raise Failure(
+            f"{COORDINATOR}: got {coordinator!r}, but the host {host!r} is unknown: {why}; {_ADVICE}"
+        ) from error
+    return found[0][0], found[0][4]
+
+
+def _check_port(family: socket.AddressFamily, address: Any) -> None:
+    """Raise OSError if the port of the coordinator is not available."""
+    with _shared_socket(family) as probe:
+        probe.bind(address)
 
 
 def leave() -> None:
@@ -342,9 +367,9 @@ def reserved_port() -> Iterator[int]:
 _CAN_SHARE = hasattr(socket, "SO_REUSEPORT")
 
 
-def _shared_socket() -> socket.socket:
+def _shared_socket(family: socket.AddressFamily = socket.AF_INET) -> socket.socket:
     """A socket whose port other sockets of this user may share if all of them request it, as gRPC does."""
-    made = socket.socket()
+    made = socket.socket(family)
     if _CAN_SHARE:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
     return made

@@ -281,7 +281,13 @@ class HopfSolution(files.Saved):
         controls, disturbances = (each if there else None for each, there in zip(sets, header["players"], strict=True))
         labels = labelling.of_file(header["labels"])
         return cls(
-            game, header["horizon"], controls, disturbances, int(header["intervals"]), float(header["tol"]), labels
+            game,
+            float(header["horizon"]),
+            controls,
+            disturbances,
+            int(header["intervals"]),
+            float(header["tol"]),
+            labels,
         )
 
     def __repr__(self) -> str:

@@ -191,6 +191,8 @@ class NeuralSolution(files.Saved):
         """The arrays of a file."""
         shapes = tuple((None,) * axes for axes in range(3))
         names = [*header["fields"], "lo", "hi", "history"]
+        if header["layers"] > len(header["arrays"]):  # before a loop over a number that may be anything
+            raise FileError(f"its {len(header['arrays'])} arrays cannot be {header['layers']} layers")
         for i in range(header["layers"]):
             names += [f"matrix{i}", f"bias{i}"]
         return {name: files.Expected(shapes, (np.float64,), optional=False) for name in names}

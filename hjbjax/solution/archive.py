@@ -50,6 +50,8 @@ def grid_of(about: dict[str, Any], lo: np.ndarray, hi: np.ndarray) -> Grid:
         tuple(about.get("modes", ())),
         about.get("edges", "projected"),
     )  # in older files all ends are projected
+    if not all(isinstance(mode, str) for mode in modes):  # the other names are checked by ``Grid``
+        raise FileError(f"its modes are {modes}, wanted text")
     rest = slice(1 if modes else 0, None)  # without the axis of modes
     return with_modes(Grid(
         lo[rest], hi[rest], tuple(about["shape"])[rest], about["periodic"][rest],

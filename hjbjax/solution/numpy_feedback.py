@@ -40,6 +40,7 @@ less than a fraction of 32 ε Σ_i M_i max(1, |lo_i|/(hi_i − lo_i), |hi_i|/(hi
 epsilon ε of the type of ``value``.
 """
 
+import errno
 import itertools
 import json
 from typing import Any
@@ -190,15 +191,26 @@ def load(path: Any) -> Feedback:
     """The feedback in a file written by ``Solution.export``; never runs code from the file.
 
     Raises:
-      ValueError: the file was not written by ``export``, or by a newer version.
+      ValueError: the file is damaged, or was not written by ``export``, or by a newer version.
       OSError: the file cannot be read.
     """
-    file = np.load(path, allow_pickle=False)
-    if "header" not in getattr(file, "files", ()):
-        raise ValueError(f"{path}: not a file written by Solution.export")
-    with file:
-        header = json.loads(file["header"].tobytes())
-        if header["format"] != FORMAT or header["version"] > VERSION:
-            found = f"{header['format']}, version {header['version']}"
-            raise ValueError(f"{path}: got {found}; wanted {FORMAT} up to version {VERSION}, from Solution.export")
-        return Feedback(header, {name: file[name] for name in header["arrays"]})
+    try:
+        header, arrays = _read(path)
+        if header["format"] == FORMAT and header["version"] <= VERSION:
+            return Feedback(header, {name: arrays[name] for name in header["arrays"]})
+        found = f"{header['format']}, version {header['version']}"
+    except OSError as error:
+        if error.errno not in (None, errno.EINVAL):  # offsets in a damaged file may lie before its start
+            raise
+        raise ValueError(f"{path}: damaged ({error})") from error
+    except Exception as error:  # zipfile, json and NumPy raise a dozen types for damaged bytes
+        raise ValueError(
+            f"{path}: damaged, or not a file written by Solution.export ({type(error).__name__}: {error})"
+        ) from error
+    raise ValueError(f"{path}: got {found}; wanted {FORMAT} up to version {VERSION}, from Solution.export")
+
+
+def _read(path: Any) -> "tuple[dict, dict[str, np.ndarray]]":
+    """The header and all arrays of a file."""
+    with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+        return json.loads(file["header"].tobytes()), {name: file[name] for name in file.files}

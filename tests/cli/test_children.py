@@ -374,6 +374,15 @@ def test_a_child_that_follows_imports_from_where_its_launcher_does(launch, tmp_p
     assert found.out == ["['0']"]
 
 
+def test_a_child_does_not_end_in_a_prompt(tmp_path, monkeypatch):
+    """Its exit code would be 1 in any case."""
+    (tmp_path / "ends.py").write_text("raise SystemExit(3)")
+    monkeypatch.syspath_prepend(tmp_path)
+    command = children.followed("ends", [], {**os.environ, "PYTHONINSPECT": "1"})
+    with subprocess.Popen(command.words, env=command.environment, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        assert run.wait(timeout=LIMIT) == 3
+
+
 def test_a_child_that_reads_finds_no_input(launch):
     found = launch("print(repr(sys.stdin.read()))", follow=True)
     found.ended()

@@ -233,7 +233,27 @@ def test_a_port_is_reserved_until_the_first_process_has_it():
     with launch.reserved_port() as port:
         with pytest.raises(OSError, match="in use"), socket.create_server(("127.0.0.1", port)):
             pass
-        launch._check_port(f"127.0.0.1:{port}")
+        launch._check_port(*launch._address_of(f"127.0.0.1:{port}"))
+
+
+@pytest.mark.parametrize("number", ["0", "1"])
+@pytest.mark.parametrize("host", ["no-such-host.invalid", "a..b", "x" * 90])
+def test_a_host_that_is_unknown_is_named_in_one_line(host, number, tmp_path, monkeypatch):
+    """JAX would wait for it for five minutes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: pytest.fail("JAX looks for the host"))
+    as_member(monkeypatch, **{launch.RANK: number, launch.COORDINATOR: f"{host}:4000"})
+    refused(("solve", "pendulum"), f"HJBJAX_COORDINATOR: got '{host}:4000', but the host '{host}' is unknown")
+
+
+def test_the_host_of_another_machine_is_not_taken_for_a_port_in_use(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    as_member(monkeypatch, **{launch.COORDINATOR: "192.0.2.1:4000"})  # RFC 5737: an address of no machine
+    refused(("solve", "pendulum"), "Cannot assign requested address; process 0 must run on the host in HJBJAX_COORD")
+
+
+def test_the_host_may_be_an_address_of_ipv6():
+    assert launch._address_of("[::1]:4000")[1][:2] == ("::1", 4000)
 
 
 @pytest.mark.parametrize("number", ["0", "1"])

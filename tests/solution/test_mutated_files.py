@@ -13,7 +13,10 @@ import pytest
 from counted_reads import counted_reads
 
 import hjbjax as hjb
-from hjbjax.solution import checkpoints
+from hjbjax.calibration.optimisation import Fit
+from hjbjax.neural.solution import NeuralSolution
+from hjbjax.problem.mode_axis import with_modes
+from hjbjax.solution import checkpoints, files
 from hjbjax.solution.locked_file import LockedFile
 
 COUNT = 1000  # files that must be refused
@@ -125,6 +128,70 @@ def npy(array):
     stream = io.BytesIO()
     np.save(stream, array)
     return stream.getvalue()
+
+
+def modes(path):
+    grid = with_modes(hjb.Grid([-1.0], [1.0], (3,)), ("low", "high"))
+    hjb.Solution(grid, np.zeros(grid.shape), None, code=hjb.Status.CONVERGED).save(path)
+    return hjb.load
+
+
+def hopf(path):
+    ball = hjb.convex.ball([0.0, 0.0], 1.0)
+    hjb.hopf(hjb.Problem(lambda x, u: u, None, hjb.Box([-1.0] * 2, [1.0] * 2), terminal_cost=ball), 1.0).save(path)
+    return hjb.HopfSolution.load
+
+
+def fit(path):
+    Fit({"a": np.ones(2)}, 1.0, np.ones(3), hjb.Status.CONVERGED).save(path)
+    return hjb.Fit.load
+
+
+def network(path):
+    weights = ((np.ones((1, 2)), np.zeros(2)), (np.ones((2, 1)), np.zeros(1)))
+    header = {"ansatz": "RestAnsatz", "fields": [], "layers": 2, "format": NeuralSolution.FORMAT}
+    arrays = {
+        f"{name}{i}": each
+        for i, pair in enumerate(weights)
+        for name, each in zip(("matrix", "bias"), pair, strict=True)
+    }
+    files.write(path, {**header, "version": 1}, {**arrays, "lo": np.zeros(1), "hi": np.ones(1), "history": np.ones(1)})
+    return NeuralSolution.load
+
+
+@pytest.mark.parametrize(
+    ("make", "keys", "wrong", "part"),
+    [
+        (modes, ("grid", "modes"), ["low", 7], "modes are .* wanted text"),
+        (modes, ("grid", "modes"), [None, "high"], "modes are .* wanted text"),
+        (hopf, ("horizon",), None, "not .NoneType"),
+        (hopf, ("horizon",), "soon", "convert string"),
+        (fit, ("names",), [None], "names of parameters are .* wanted text"),
+        (network, ("layers",), 10**30, "arrays cannot be 1000"),
+        (
+            network,
+            ("layers",),
+            10**9,
+            "arrays cannot be 1000",
+        ),  # a loop over all of them took minutes and the memory of the machine
+    ],
+)
+def test_a_header_with_another_kind_of_entry_is_refused(make, keys, wrong, part, tmp_path):
+    """Also if only a look at the result would fail."""
+    path = tmp_path / "run.npz"
+    load = make(path)
+    with zipfile.ZipFile(path) as source:
+        content = {name: source.read(name) for name in source.namelist()}
+    table = header = json.loads(np.load(io.BytesIO(content["header.npy"])).tobytes())
+    for key in keys[:-1]:
+        table = table[key]
+    table[keys[-1]] = wrong
+    content["header.npy"] = npy(np.frombuffer(json.dumps(header).encode(), np.uint8))
+    with zipfile.ZipFile(path, "w") as archive:
+        for each, member in content.items():
+            archive.writestr(each, member)
+    with pytest.raises(hjb.FileError, match=f"cannot be read: .*{part}"):
+        load(path)
 
 
 @pytest.mark.parametrize("make", [solution, checkpoint])

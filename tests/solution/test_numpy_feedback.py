@@ -150,6 +150,32 @@ def test_other_files_are_refused(tmp_path):
         Solution(GRID, np.zeros((2, *GRID.shape)), None, code=np.ones(2)).export(tmp_path / "batch.npz")
 
 
+def test_a_damaged_file_is_refused_as_documented_or_says_the_same(tmp_path):
+    """Cut at the end or within, and with an inverted byte: its readers raise six other types."""
+    path, damaged = tmp_path / "whole.npz", tmp_path / "damaged.npz"
+    CASES["mean"][0].export(path)
+    whole, state = path.read_bytes(), [0.1, 7.0]
+    wanted = numpy_feedback.load(path).control(state)
+    contents = [whole[:n] for n in range(0, len(whole), 97)]
+    contents += [whole[:n] + whole[n + 7 :] for n in range(0, len(whole), 211)]
+    contents += [whole[:n] + bytes([whole[n] ^ 0xFF]) + whole[n + 1 :] for n in range(0, len(whole), 37)]
+    refused = 0
+    for content in contents:
+        damaged.write_bytes(content)
+        try:
+            found = numpy_feedback.load(damaged)
+        except ValueError:
+            refused += 1
+        else:
+            np.testing.assert_array_equal(found.control(state), wanted)
+    assert refused > len(contents) / 2
+    damaged.write_bytes(whole[:-50])
+    with pytest.raises(ValueError, match=r"damaged\.npz: damaged, or not a file written by Solution\.export"):
+        numpy_feedback.load(damaged)
+    with pytest.raises(FileNotFoundError):
+        numpy_feedback.load(tmp_path / "nowhere.npz")
+
+
 @pytest.mark.slow
 def test_the_controllers_changes_of_mode_are_exported(tmp_path):
     problem, grid = hjb.zoo.thermostat(shape=(41,))

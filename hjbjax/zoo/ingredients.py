@@ -129,6 +129,18 @@ def discounted_time(time: Number, discount: Number) -> Scalar:
     return jnp.where(discount == 0, time, -jnp.expm1(-rate * time) / rate)
 
 
+def time_formula(discount: Number) -> str:
+    """The formula of ``discounted_time`` for plots.
+
+    Example:
+      >>> time_formula(1.0), time_formula(0), time_formula(0.5)
+      ('1 − e⁻ᵀ', 'T', '(1 − e^(−βT))/β')
+    """
+    if is_traced(discount) or discount not in (0, 1):
+        return "(1 − e^(−βT))/β"
+    return "1 − e⁻ᵀ" if discount == 1 else "T"
+
+
 def root(square: Number) -> Scalar:
     """√max(s, 0), with the derivative 0 where s ≤ 0, for distances with a corner."""
     inside = square > 0

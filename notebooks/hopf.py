@@ -73,6 +73,6 @@ axis.contour(positions, positions, value.T, [0.0], colors="white")
 axis.plot([], [], color="white", label="V = 0")  # contours have no label
 axis.legend(loc="lower left", labelcolor="white", frameon=False)
 axis.set(xlabel="position of the first cart [m]", ylabel="position of the last cart [m]", aspect="equal")
-figure.colorbar(shades, label="V [m]")
+figure.colorbar(shades, label="V [m]", ticks=np.arange(-0.2, 1.1, 0.2))
 plt.show()
 assert value.min() < 0 < value.max()

@@ -19,6 +19,8 @@ Scalar: TypeAlias = Num[Array, ""]
 Exact: TypeAlias = Callable[[State | Sequence[float]], Scalar]  # V at one state, an array or a plain list
 Feedback: TypeAlias = Callable[[State], Control]
 
+# the name of ``discounted_time`` on plots; without the number β, because names are static and would recompile
+TIME = "(1 − e⁻ᵝᵀ)/β"
 ROUNDING = 1e-6  # relative rounding of a best control computed in float32; a control on its bound is admissible
 
 
@@ -127,18 +129,6 @@ def discounted_time(time: Number, discount: Number) -> Scalar:
     rate = jnp.where(discount == 0, 1.0, discount)
     # expm1 keeps the digits that 1 − e^{−βT} would lose to cancellation for small β; tested down to β = 1e-9
     return jnp.where(discount == 0, time, -jnp.expm1(-rate * time) / rate)
-
-
-def time_formula(discount: Number) -> str:
-    """The formula of ``discounted_time`` for plots.
-
-    Example:
-      >>> time_formula(1.0), time_formula(0), time_formula(0.5)
-      ('1 − e⁻ᵀ', 'T', '(1 − e^(−βT))/β')
-    """
-    if is_traced(discount) or discount not in (0, 1):
-        return "(1 − e^(−βT))/β"
-    return "1 − e⁻ᵀ" if discount == 1 else "T"
 
 
 def root(square: Number) -> Scalar:

@@ -22,7 +22,6 @@ from hjbjax.zoo.ingredients import (
     answer,
     check_positive,
     noise_or_none,
-    time_formula,
     unit_cost,
 )
 
@@ -129,10 +128,7 @@ def brownian_exit(
     """
     # check first, otherwise a half width ≤ 0 would be reported as a wrong corner of the grid
     check_positive("brownian_exit", noise=noise, half_width=half_width)
-    problem = Problem(
-        no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level,
-        value_name=f"V = E[{time_formula(discount)}]",
-    )  # fmt: skip
+    problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
     # odd numbers put a node at the centre
     shape = ((101,) if dim == 1 else (41,) * dim) if shape is None else shape
     return problem, Grid([-half_width] * dim, [half_width] * dim, shape, units=("m",) * dim)

@@ -47,9 +47,10 @@ assert upper - lower < 0.01
 path = hjb.simulate(problem, solution.control_at, start, 3.0, time_varying=True, hold=0.05)
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
 axes[0].plot(path.times, path.states[:, :carts], label=[f"cart {i + 1}" for i in range(carts)])
-axes[0].set(xlabel="t", ylabel="positions")
-axes[1].step(path.times[:-1], path.controls, where="post", label=["first cart", "last cart"])
-axes[1].set(xlabel="t", ylabel="forces")
+axes[0].set(xlabel="t [s]", ylabel="position [m]")
+for motor, (style, name) in enumerate((("-", "first cart"), ("--", "last cart"))):
+    axes[1].step(path.times[:-1], path.controls[:, motor], style, where="post", label=name)
+axes[1].set(xlabel="t [s]", ylabel="force [N]")
 for axis in axes:
     axis.legend(frameon=False)
 plt.show()
@@ -62,14 +63,16 @@ assert abs(float(path.cost) - solution.value_at(0.0, start)) < 0.05
 # The value on a plane through the ten-dimensional state: the positions of the first and the last cart, all others zero.
 
 # %%
-positions = np.linspace(-3.0, 3.0, 11)
-states = np.zeros((11, 11, 2 * carts))
+positions = np.linspace(-3.0, 3.0, 41)
+states = np.zeros((41, 41, 2 * carts))
 states[..., 0], states[..., carts - 1] = np.meshgrid(positions, positions, indexing="ij")
 value = solution.value_at(0.0, states)
 figure, axis = plt.subplots(figsize=(4.6, 3.8), layout="constrained")
-shades = axis.contourf(positions, positions, value.T, 15)
+shades = axis.contourf(positions, positions, value.T, np.arange(-0.35, 1.1, 0.1))  # not the minimum, −0.3
 axis.contour(positions, positions, value.T, [0.0], colors="white")
-axis.set(xlabel="position of the first cart", ylabel="position of the last cart", aspect="equal", title="white: V = 0")
-figure.colorbar(shades, label="V")
+axis.plot([], [], color="white", label="V = 0")  # contours have no label
+axis.legend(loc="lower left", labelcolor="white", frameon=False)
+axis.set(xlabel="position of the first cart [m]", ylabel="position of the last cart [m]", aspect="equal")
+figure.colorbar(shades, label="V [m]", ticks=np.arange(-0.2, 1.1, 0.2))
 plt.show()
 assert value.min() < 0 < value.max()

@@ -56,12 +56,15 @@ with jax.enable_x64(True):
     exact = np.asarray(jax.vmap(hjb.zoo.double_integrator_exact())(grid.nodes().reshape(-1, 2))).reshape(grid.shape)
 
 levels = np.linspace(0.1, 0.9, 9)
-figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharey=True)
+figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharex=True, sharey=True)
 plotting.value(solution, ax=axes[0], levels=levels)
 axes[0].set_title("computed")
-axes[1].contour(grid.axis(0), grid.axis(1), exact.T, levels, colors="black", linewidths=1)
-axes[1].contour(grid.axis(0), grid.axis(1), np.asarray(solution.value).T, levels, colors="tab:red", linestyles=":")
-axes[1].set_title("exact (black), computed (red)")
+for values, style, name in ((exact, "-", "exact"), (np.asarray(solution.value), ":", "computed")):
+    color = "black" if name == "exact" else plotting.COLOURS[1]
+    axes[1].contour(grid.axis(0), grid.axis(1), values.T, levels, colors=color, linestyles=style, linewidths=1.4)
+    axes[1].plot([], [], style, color=color, label=name)  # contours have no label
+axes[1].set_title("contour lines 0.1, 0.2, …, 0.9", pad=20)
+axes[1].legend(loc="lower left", bbox_to_anchor=(0.0, 0.98), ncols=2, frameon=False)
 axes[1].set_xlabel(grid.labels[0])
 plt.show()
 
@@ -103,7 +106,7 @@ assert abs(exponent - 0.5) < 0.05
 velocity = np.linspace(-2.0, 2.0, 201)
 figure, ax = plt.subplots(figsize=(5.4, 4.2), layout="constrained")
 plotting.policy(solution, ax=ax)
-ax.plot(-0.5 * velocity * abs(velocity), velocity, "--", color=plotting.COLOURS[4], label="exact")
+ax.plot(-0.5 * velocity * abs(velocity), velocity, "--", color=plotting.COLOURS[1], label="exact")
 plotting.switching_curve(solution, ax=ax, label="computed switching curve")
 plt.show()
 

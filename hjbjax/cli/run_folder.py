@@ -263,7 +263,8 @@ def closed_path(
     """The path of the closed loop, followed by the final phase inside the target.
 
     If the control jumps or is a direction, the mean of two controls is not optimal, so the Hamiltonian is minimised at
-    every state. A control that jumps is sampled, because an adaptive integrator is very slow along a switching curve.
+    every state. Over one state the mean is the control that holds the state at a switching point, so it is used. A
+    control that jumps is sampled, because an adaptive integrator is very slow along a switching curve.
     On a curve along which the path slides, the side of a state is known only up to a cell, so the control chatters if
     it is sampled several times per cell. A second simulation holds it for the time in which the path crosses a cell.
     """
@@ -271,6 +272,7 @@ def closed_path(
     options: dict[str, Any] = {"key": 0} if is_random(problem) else {}
     if mode is not None:
         options["mode"] = mode
+    jumps = jumps and (solution.discrete or len(solution.grid.state_axes) > 1)
     if jumps:
         options["hold"] = duration / SAMPLES
     sharp = jumps or _is_direction(problem, solution)

@@ -453,7 +453,7 @@ def block_problem(problem: Problem, blocks: Blocks, index: int, n: int) -> Probl
         discount=problem.discount, isaacs=problem.isaacs, time_dependent=problem.time_dependent, inside=problem.inside,
         control_names=[problem.control_names[j] for j in block.controls] if problem.control_names else (),
         control_units=[problem.control_units[j] for j in block.controls] if problem.control_units else (),
-        **parts,
+        time_unit=problem.time_unit, **parts,
     )  # fmt: skip
 
 

@@ -65,7 +65,7 @@ def costates(
             # broad and pale, so that λ remains visible where the two agree
             style: dict[str, Any] = {"color": colours[i], "linewidth": 3.6, "alpha": 0.4, "linestyle": "--"}
             artists += ax.plot(times, slopes[:, i], label=f"DV, {names[i]}", **style)
-    label_axes(ax, time_label(None if solution is None else solution.grid), "costate")
+    label_axes(ax, time_label(None if solution is None else solution.grid, described(solution).labels), "costate")
     set_ticks(ax.xaxis, False)
     set_ticks(ax.yaxis, False)
     return Picture([*artists, legend(ax)], ax)
@@ -115,7 +115,7 @@ def controls(
             mean = _running_mean(times, inputs[:, i], width)
             look = {"color": look["color"], "linewidth": 1.4}
             means += ax.plot(times, mean, label=f"{name}, mean over {width:.2g}", **look)
-    time = time_label(None if solution is None else solution.grid, words.control_units)
+    time = time_label(None if solution is None else solution.grid, words)
     label_axes(ax, time, names[0] if count == 1 else "control")
     set_ticks(ax.xaxis, False)
     set_ticks(ax.yaxis, False)

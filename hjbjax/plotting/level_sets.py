@@ -277,7 +277,6 @@ def _caption(field: Field, fixed: Mapping[str, float]) -> str:
 
 def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, label: str | None) -> Picture:
     """Draw the surface V = 0 over the three free axes."""
-    from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     grid = field.grid
@@ -293,8 +292,7 @@ def _surface(field: Field, fixed: Mapping[str, float], ax: Any, color: str, labe
     ax.set(xlim=ends[0], ylim=ends[1], zlim=ends[2])
     for axis, number, text in zip((ax.xaxis, ax.yaxis, ax.zaxis), free, "xyz", strict=True):
         # few ticks, because from the side more would overlap, as would the last one of x and the first one of y
-        axis.set_major_locator(MaxNLocator(4, prune="upper" if text == "x" else None))
-        set_ticks(axis, is_angle(grid, number))
+        set_ticks(axis, is_angle(grid, number), nbins=4, prune="upper" if text == "x" else None)
         getattr(ax, f"set_{text}label")(grid.labels[number], labelpad=8)
     # smaller than its frame, otherwise the label on the right would be cut off
     ax.set_box_aspect(box_sides(grid, free), zoom=0.86)

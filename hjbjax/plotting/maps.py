@@ -335,8 +335,8 @@ def closed_loop(
         artists += trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
     upper = styled(figure.add_subplot(columns[0, -1]))
     artists += trajectory(path, ax=upper, axes=None, grid=grid)
-    if driven:
-        upper.set_xlabel("")  # the lower axes have the label of the time
+    upper.set_xlabel("" if driven else time_label(grid, described(solution).labels))
+    if driven:  # the lower axes have the label of the time
         lower = styled(figure.add_subplot(columns[1, -1], sharex=upper))
         artists += controls(path, ax=lower, solution=solution)
         upper.tick_params(labelbottom=False)

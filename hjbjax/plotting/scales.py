@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from hjbjax.problem.grid import Grid
+from hjbjax.problem.labels import Labels, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 PER_TIME = re.compile(r"/ ?(s|min|h|hour|day|week|month|year)\b")  # a rate, but not m/s²
 LENGTHS = ("m", "km", "cm", "mm", "µm", "um", "nm", "ft", "in", "mi", "nmi", "nautical miles", "au", "AU")
 ANGLES = ("rad", "radian", "radians")
+ROUND = (1, 2, 5, 10)  # leading digits of tick spacings; with 2.5 labels such as −0.75 and −0.5 touch
+NAMELESS = Labels()
 FEWEST, MOST = 3, 7  # ticks of an angle; with fewer, decimals are better than fractions of π
 STEPS = [Fraction(1, 4), Fraction(1, 2), *(Fraction(2**k) for k in range(12))]  # tick spacings, in multiples of π
 
@@ -71,16 +74,18 @@ def place_text(grid: Grid, axis: int, place: float) -> str:
     return (angle_text(place) if simple else f"{place:.4g}") + unit
 
 
-def time_label(grid: Grid | None, control_units: Iterable[str] = ()) -> str:
-    """The label of a time axis, with the unit of time in which a state or a control is measured, such as m/s or 1/year.
+def time_label(grid: Grid | None, labels: Labels = NAMELESS) -> str:
+    """The label of a time axis, with the unit of the problem, or of a state or a control such as m/s or 1/year.
 
     Example:
       >>> time_label(Grid([0.0], [1.0], (4,), units=("m/s",))), time_label(Grid([0.0], [1.0], (4,)))
       ('t [s]', 't')
-      >>> time_label(None, ("1/year",))
-      't [year]'
+      >>> time_label(None, Labels(("consumption",), ("1/year",))), time_label(None, Labels(time_unit="h"))
+      ('t [year]', 't [h]')
     """
-    for unit in (*(() if grid is None else grid.units), *control_units):
+    if labels.time_unit:
+        return with_unit("t", labels.time_unit)
+    for unit in (*(() if grid is None else grid.units), *labels.control_units):
         found = PER_TIME.search(unit)
         if found:
             return f"t [{found[1]}]"
@@ -109,10 +114,14 @@ def box_sides(grid: Grid, axes: Sequence[int]) -> tuple[float, ...]:
     )
 
 
-def set_ticks(axis: Any, angle: bool) -> None:
-    """Format a matplotlib axis with numbers without an offset, or multiples of π if it is an angle and long enough."""
-    from matplotlib.ticker import FuncFormatter, MultipleLocator
+def set_ticks(axis: Any, angle: bool, **options: Any) -> None:
+    """Format a matplotlib axis with numbers without an offset, or multiples of π if it is an angle and long enough.
 
+    The options are those of matplotlib's ``MaxNLocator``, for numbers.
+    """
+    from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
+
+    axis.set_major_locator(MaxNLocator(**({"nbins": "auto", "steps": ROUND} | options)))
     axis.set_major_formatter(FuncFormatter(number_text))
     step = angle_step(*axis.get_view_interval()) if angle else None
     if step is not None:

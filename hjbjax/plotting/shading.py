@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
 
-FLAT = 1e-4  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
+FLAT = 1e-3  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
 OBSTACLE = "obstacle"  # the label of a set that is drawn solid
 HATCH, DOTS, STROKE = "////", "..", "#909090"
 EXTREME = 1e-6  # fraction of the range: a control closer to its end counts as being there
@@ -36,7 +36,7 @@ class Look:
       label: the label of the numbers.
       hidden: the legend for nodes without a number; empty to leave them unmarked over one axis.
       colorbar: draw a colour bar.
-      diverging: put zero in the middle of the colours if both signs occur.
+      diverging: put zero in the middle of the colours, grey, if both signs occur.
       cells: draw nodes as cells instead of shading smoothly.
       span: the range of the numbers; a variation below ``FLAT`` times the span counts as zero. 0 if unknown.
       idle: the nodes whose numbers are not shown because no control acts there, bool, in the shape of the section.
@@ -61,7 +61,10 @@ def draw(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...] = (
     mask = np.ma.getmaskarray(section.values)
     if len(section.axes) == 1:
         line = look.shown(section)
-        artists: list[Artist] = [*ax.plot(section.coordinates[0], line, color=COLOURS[0], linewidth=1.6)]
+        steps = "steps-mid" if look.cells else "default"  # a slope over one cell would be a control that is not used
+        artists: list[Artist] = [
+            *ax.plot(section.coordinates[0], line, color=COLOURS[0], linewidth=1.6, drawstyle=steps)
+        ]
         artists += bands(ax, section.coordinates[0], mask, look.hidden) if look.hidden else []
         known = line.compressed()
         if known.size and is_level(known, look.span):  # otherwise the axis would show rounding errors
@@ -118,28 +121,29 @@ def _mesh(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...]) -
 
 
 def _colours(known: np.ndarray, look: Look) -> tuple[float, float, Colormap]:
-    """The limits of the colours and their map: the full diverging map for both signs, half of it for one sign."""
+    """The limits of the colours and their map.
+
+    Both maps rise in lightness, so a picture printed in grey does not show two numbers as one shade. The map for both
+    signs goes from blue over grey at zero to yellow.
+    """
     from matplotlib import colormaps
-    from matplotlib.colors import LinearSegmentedColormap
 
     if known.size == 0:
         return 0.0, 1.0, colormaps["viridis"]
     lo, hi = float(known.min()), float(known.max())
     level = is_level(known, look.span)
     largest = max(abs(lo), abs(hi)) or look.span or 1.0
-    both = colormaps["coolwarm"]
     if not look.diverging:
         if level:
             lo, hi = limits_around((lo + hi) / 2, look.span)
         return lo, hi if hi > lo else lo + 1.0, colormaps["viridis"]
     if lo < -EXTREME * largest and hi > EXTREME * largest:
-        return -largest, largest, both
-    # for one sign use half of the map, because the other half would stand for numbers that do not occur
+        return -largest, largest, colormaps["cividis"]
     if hi > EXTREME * largest:
-        return 0.0, largest, LinearSegmentedColormap.from_list("warm", both(np.linspace(0.5, 1.0, 128)))
+        return 0.0, largest, colormaps["viridis"]
     if lo < -EXTREME * largest:
-        return -largest, 0.0, LinearSegmentedColormap.from_list("cool", both(np.linspace(0.0, 0.5, 128)))
-    return -largest, largest, both
+        return -largest, 0.0, colormaps["viridis"]
+    return -largest, largest, colormaps["cividis"]
 
 
 def fill_missing(values: np.ma.MaskedArray) -> np.ndarray:
@@ -245,7 +249,7 @@ def add_colorbar(ax: Axes, mesh: Any, label: str) -> Any:
     bar.outline.set_visible(False)
     bar.ax.tick_params(width=0.8, length=3, labelsize=9)
     # a text, because the layout reserves room for it but not for a title; the unit goes below the name, to save width
-    above = label.replace(" [", "\n[")
+    above = label.replace(" [", "\n[").replace(" = ", " =\n")
     bar.ax.text(0.0, 1.02, above, transform=bar.ax.transAxes, ha="left", va="bottom", fontsize=9, gid="label")
     return bar
 

@@ -110,7 +110,7 @@ def perturbation(study: Perturbation, *, ax: Axes | None = None) -> Picture:
             x, y = series.parameters[series.fitted], series.errors[series.fitted]
             middle = np.exp(np.mean(np.log(y)) - series.order * np.mean(np.log(x)))
             artists += ax.plot(x, middle * x**series.order, color=GREY, linewidth=3, zorder=0)
-    logarithmic(ax)
+    logarithmic(ax, np.unique(np.concatenate([study.noise.parameters, study.gain.parameters])))
     label_axes(ax, "ε, 1/γ", "largest change")
     # the lines rise, so this corner is free
     artists.append(ax.legend(loc="upper left", fontsize=8, frameon=False, borderaxespad=0.2, handlelength=1.4))

@@ -1,4 +1,4 @@
-"""Names and units of states and controls for plots and printed tables, the side of a level set, and cost or reward.
+"""Names and units of states, controls, value and time for plots and tables, the side of a level set, cost or reward.
 
 These texts do not enter a computation. They are static, so that they survive ``jit`` and ``vmap``.
 """
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 SIDES = ("below", "above")
+EXAMPLES = {"value_name": "V = 1 − e⁻ᵀ", "time_unit": "s"}
 COST, REWARD = "cost", "reward"  # the words for what the control minimises or maximises
 
 
@@ -19,6 +20,8 @@ class Labels(NamedTuple):
       inside: "below" if {V ≤ 0} is the set of interest, "above" if it is {V ≥ 0}.
       payoff: "cost" if the control minimises, "reward" if it maximises. The labels of a ``Solution`` say which of the
         two its value is.
+      value: V in a formula, as in "V = 1 − e⁻ᵀ", or empty.
+      time_unit: the unit of time, or empty.
 
     Example:
       >>> Labels(("torque",), ("N m",)).control(0, 1), Labels().control(1, 2)
@@ -31,6 +34,8 @@ class Labels(NamedTuple):
     control_units: tuple[str, ...] = ()
     inside: str = "below"
     payoff: str = COST
+    value: str = ""
+    time_unit: str = ""
 
     @property
     def long_name(self) -> str:
@@ -40,7 +45,7 @@ class Labels(NamedTuple):
     @property
     def of_value(self) -> str:
         """The name of V on axes and colour bars."""
-        return "V" if self.payoff == COST else f"V, {self.payoff}"
+        return self.value or ("V" if self.payoff == COST else f"V, {self.payoff}")
 
     def word(self, text: str) -> str:
         """A name or a phrase about costs, in the words of the problem."""
@@ -67,17 +72,23 @@ def words(given: object, count: int | None, what: str) -> tuple[str, ...]:
     return tuple(given)
 
 
-def checked(controls: object, units: object, inside: object, count: int | None) -> Labels:
+def checked(
+    controls: object, units: object, inside: object, count: int | None, value: object = "", time_unit: object = ""
+) -> Labels:
     """The labels of a problem with ``count`` controls, or with an unknown number, after checks."""
     if inside not in SIDES:
         raise ValueError(f"Problem.inside: got {inside!r}, wanted 'below' (the set is V ≤ 0) or 'above' (V ≥ 0)")
+    for name, text in {"value_name": value, "time_unit": time_unit}.items():
+        if not isinstance(text, str):
+            raise TypeError(f"Problem.{name}: got {text!r}, wanted a text, as in {name}={EXAMPLES[name]!r}")
     names = words(controls, count, "Problem.control_names")
-    return Labels(names, words(units, count, "Problem.control_units"), str(inside))
+    units = words(units, count, "Problem.control_units")
+    return Labels(names, units, str(inside), value=str(value), time_unit=str(time_unit))
 
 
 def of_file(stored: Sequence) -> Labels:
-    """The labels in the header of a file, after checks; older files do not say whether V is a cost or a reward."""
-    names, units, inside, payoff = (*stored, COST)[:4]
-    if payoff not in (COST, REWARD) or len(stored) > 4:
+    """The labels in the header of a file, after checks; older files have fewer of them."""
+    names, units, inside, payoff, value, time_unit = (*stored, *Labels()[len(stored) :])[:6]
+    if payoff not in (COST, REWARD) or len(stored) > 6:
         raise ValueError(f"labels: got {payoff!r:.60}, wanted {COST!r} or {REWARD!r}")
-    return checked(names, units, inside, None)._replace(payoff=str(payoff))
+    return checked(names, units, inside, None, value, time_unit)._replace(payoff=str(payoff))

@@ -34,6 +34,7 @@ PAYMENTS = {  # the payments of a problem with rewards, and the same payments as
 }
 STATIC = (
     "isaacs", "time_dependent", "control_names", "control_units", "inside", "discounted", "payoff", "push_steps",
+    "value_name", "time_unit",
 )  # fmt: skip
 
 
@@ -90,6 +91,8 @@ class Problem:
       control_names, control_units: one text per control, for plots, as in ("torque",) and ("N m",).
       inside: the side of the zero level that is the set of interest, for plots: ``"below"`` for {V ≤ 0}, ``"above"``
         for {V ≥ 0}, as in ``avoid``.
+      value_name: V for plots, if it is not the cost itself, as in "V = 1 − e⁻ᵀ". Default: V.
+      time_unit: the unit of time for plots, as in "s". Default: from the units of states and controls, such as m/s.
 
     Raises:
       ValueError: an ingredient that contradicts another, or a number that is not admissible.
@@ -129,6 +132,8 @@ class Problem:
     exit_reward: Any = None
     terminal_reward: Any = None
     stopping_reward: Any = None
+    value_name: str = ""
+    time_unit: str = ""
     discounted: bool | None = dataclasses.field(init=False, default=None, repr=False)
     payoff: str = dataclasses.field(init=False, default=COST, repr=False)
     # the part of the discount that is a function of the state, in the problem of a march; the other part is constant
@@ -171,12 +176,14 @@ class Problem:
         exit_reward: Callable | Number | None = None,
         terminal_reward: Callable | Number | None = None,
         stopping_reward: Callable | Number | None = None,
+        value_name: str = "",
+        time_unit: str = "",
     ):
         _check_functions(drift, target)
         _check_sets(controls, disturbances)
         # unknown for a function of the state
         count = None if callable(controls) else 0 if controls is None else controls.dim
-        words = labelling.checked(control_names, control_units, inside, count)
+        words = labelling.checked(control_names, control_units, inside, count, value_name, time_unit)
         # static: the order of min and max is part of a compiled program
         if isaacs not in ("upper", "lower"):
             raise ValueError(f"Problem.isaacs: got {isaacs!r}, wanted 'upper' (min max) or 'lower' (max min)")
@@ -222,6 +229,8 @@ class Problem:
             "control_names": words.controls,
             "control_units": words.control_units,
             "inside": words.inside,
+            "value_name": words.value,
+            "time_unit": words.time_unit,
             # static, because ``jit`` hides numbers and the certificate must be chosen while compiling
             "discounted": growth is not None or known_sign(discount),
             "payoff": payoff,
@@ -231,8 +240,8 @@ class Problem:
 
     @property
     def labels(self) -> Labels:
-        """The words for plots and messages: names and units of the controls, side of the level set, cost or reward."""
-        return Labels(self.control_names, self.control_units, self.inside, self.payoff)
+        """The words for plots and messages: names and units, side of the level set, cost or reward."""
+        return Labels(self.control_names, self.control_units, self.inside, self.payoff, self.value_name, self.time_unit)
 
     @property
     def is_game(self) -> bool:

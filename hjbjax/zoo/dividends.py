@@ -79,8 +79,9 @@ def dividends(
     """
     firm = Reserve(income, volatility, discount)
     problem = Problem(
-        firm.drift, noise=volatility, discount=discount, target=firm.ruin, pushes=[Push([-1.0], reward=1.0)]
-    )
+        firm.drift, noise=volatility, discount=discount, target=firm.ruin, pushes=[Push([-1.0], reward=1.0)],
+        time_unit="year",
+    )  # fmt: skip
     with jax.ensure_compile_time_eval():  # numbers, if the parameters are numbers, also inside a jit of the caller
         barrier = firm.barrier if is_traced(firm) else np.asarray(float(firm.barrier))
     return problem, Grid([0.0], [2 * barrier], shape, names=("cash",))

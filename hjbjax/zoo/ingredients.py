@@ -19,6 +19,8 @@ Scalar: TypeAlias = Num[Array, ""]
 Exact: TypeAlias = Callable[[State | Sequence[float]], Scalar]  # V at one state, an array or a plain list
 Feedback: TypeAlias = Callable[[State], Control]
 
+# the name of ``discounted_time`` on plots; without the number β, because names are static and would recompile
+TIME = "(1 − e⁻ᵝᵀ)/β"
 ROUNDING = 1e-6  # relative rounding of a best control computed in float32; a control on its bound is admissible
 
 

@@ -19,7 +19,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.types import Array, Control, Number, State
-from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, check_positive, root, unit_cost
+from hjbjax.zoo.ingredients import TIME, Arrival, Disc, Exact, Scalar, answer, check_positive, root, unit_cost
 
 
 @pytree_dataclass()
@@ -117,6 +117,7 @@ def double_integrator(
         exit_cost=exact,
         control_names=("force",),
         control_units=("N",),
+        value_name=f"V = {TIME}",
     )
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"), units=("m", "m/s"))
 
@@ -161,6 +162,8 @@ def zermelo(
         target=Disc(radius, 2).level,
         exit_cost=exact,
         control_names=("course east", "course north"),
+        value_name=f"V = {TIME}",
+        time_unit="s",
     )
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("east", "north"), units=("m", "m"))
 

@@ -11,7 +11,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Disturbance, Number, State
-from hjbjax.zoo.ingredients import Exact, Scalar, answer, check_positive, discounted_time, two_modes
+from hjbjax.zoo.ingredients import TIME, Exact, Scalar, answer, check_positive, discounted_time, two_modes
 
 
 @pytree_dataclass()
@@ -119,6 +119,7 @@ def pursuit(
         boat.drift, boat.cost, Box(xp.asarray([-turn]), xp.asarray([turn])),
         disturbances=Box(xp.asarray([-evasion]), xp.asarray([evasion])), discount=discount, target=boat.capture,
         modes=Modes(("steers", "broken"), rates=two_modes(failure, 0.0)), control_names=("rudder",),
+        value_name=f"V = E[{TIME}]",
     )  # fmt: skip
     grid = Grid(
         [-3.0, -np.pi], [3.0, np.pi], shape, periodic=(False, True), names=("lead", "course"), units=("", "rad")

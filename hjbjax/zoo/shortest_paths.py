@@ -16,7 +16,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import front_door, pytree_dataclass
 from hjbjax.problem.sets import Ball, Box, Finite
 from hjbjax.problem.types import Control, Number, State
-from hjbjax.zoo.ingredients import Arrival, Disc, Exact, Scalar, answer, check_positive, root, unit_cost
+from hjbjax.zoo.ingredients import TIME, Arrival, Disc, Exact, Scalar, answer, check_positive, root, unit_cost
 
 
 # static, because the norm selects a formula
@@ -100,6 +100,8 @@ def eikonal(
         # Euclidean for every norm, because it only selects the nodes with the prescribed exact value
         target=Disc(radius, dim).level,
         exit_cost=exact,
+        value_name=f"V = {TIME}",
+        time_unit="s",
     )
     # an odd number puts a node at the origin, which is the whole target for radius 0
     return problem, Grid([-1.0] * dim, [1.0] * dim, (81,) * dim if shape is None else shape, units=("m",) * dim)
@@ -175,6 +177,7 @@ def dubins(
         target=Disc(radius, 2).level,  # with any heading; the default exit cost is zero
         control_names=("turning rate",),
         control_units=("rad/s",),
+        value_name=f"V = {TIME}",
     )
     # the heading is periodic, so its 40 nodes include −π but not π
     lo, hi = [-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi]

@@ -175,6 +175,8 @@ def brownian_ball(
         target=OutsideBall(radius).level,  # includes the corners of the box
         # no discount: with a discount the value would be a Bessel function
         exit_cost=brownian_ball_exact(dim=dim, noise=noise, radius=radius),
+        value_name="V = E[T] [s]",
+        time_unit="s",
     )
     return problem, Grid([-radius] * dim, [radius] * dim, (41,) * dim if shape is None else shape, units=("m",) * dim)
 

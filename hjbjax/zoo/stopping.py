@@ -92,7 +92,7 @@ def perpetual_put(
     put = AmericanPut(strike, interest, volatility)
     problem = Problem(
         put.drift, noise=put.noise, discount=interest, stopping_reward=put.payoff, target=put.far_away,
-        exit_reward=put.value,
+        exit_reward=put.value, time_unit="year",
     )  # fmt: skip
     return problem, Grid([0.0], [4 * strike], shape, names=("price",))
 
@@ -134,9 +134,10 @@ def american_put(
     put = AmericanPut(strike, interest, volatility)
     problem = Problem(
         put.drift, noise=put.noise, discount=interest, stopping_reward=put.payoff, target=put.is_mature,
-        exit_reward=put.payoff,
+        exit_reward=put.payoff, time_unit="year",
     )  # fmt: skip
-    return problem, Grid([0.0, 0.0], [3 * strike, maturity], shape, names=("price", "time to maturity"))
+    names, units = ("price", "time to maturity"), ("", "year")
+    return problem, Grid([0.0, 0.0], [3 * strike, maturity], shape, names=names, units=units)
 
 
 @pytree_dataclass()
@@ -236,7 +237,7 @@ def leland(
     firm = Firm(coupon, interest, volatility, payout, tax)
     problem = Problem(
         firm.drift, reward=firm.reward, noise=firm.noise, discount=interest, stopping_reward=0.0,
-        target=firm.far_away, exit_reward=firm.value,
+        target=firm.far_away, exit_reward=firm.value, time_unit="year",
     )  # fmt: skip
     with jax.ensure_compile_time_eval():  # numbers, if the parameters are numbers, also inside a jit of the caller
         boundary = jnp.log(firm.boundary) if is_traced(firm) else np.log(float(firm.boundary))

@@ -180,6 +180,19 @@ def test_a_control_that_jumps_is_held_while_the_path_crosses_a_cell():
 
 
 @pytest.mark.slow
+def test_a_point_held_at_a_switching_point_does_not_chatter():
+    """Exactly: full speed for a time of 1.5 from 1.5, then no control."""
+    entry = zoo.catalogue["bang-bang"]
+    problem, grid = entry.build()
+    solution = hjbjax.solve(problem, grid)
+    path = run_folder.closed_path(problem, solution, entry.start, entry.duration, True, None)
+    controls = path.controls[:, 0]
+    assert controls[path.times[:-1] < 1.4] == pytest.approx(-1.0)
+    assert np.abs(controls[path.times[:-1] > 2.0]).max() < 1e-3
+    assert float(path.cost) == pytest.approx(float(path.promised), rel=0.02)
+
+
+@pytest.mark.slow
 def test_the_double_integrator_switches_once():
     """Exactly: full force, then full force the other way; V = 1 − exp(−2) for a time of 2 from rest at 1."""
     entry = zoo.catalogue["double-integrator"]

@@ -8,7 +8,6 @@ import sys
 from types import SimpleNamespace
 
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 import pytest
 from matplotlib import pyplot
@@ -17,6 +16,7 @@ from pictures import hatched_nodes, scale_label
 from pictures import pictures as plotting
 
 from hjbjax import plotting as on_current_axes
+from hjbjax import zoo
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.problem import Problem
@@ -154,15 +154,30 @@ def test_policy_colours_are_centred_at_zero():
     assert scale_label(mesh) == "u"
 
 
-@pytest.mark.parametrize("name", ["viridis", "coolwarm"])
-def test_the_colour_maps_are_even_in_lightness(name):
-    """viridis rises, coolwarm rises and falls, in CIE lightness; jet would do neither."""
-    rgb = matplotlib.colormaps[name](np.linspace(0, 1, 33))[:, :3]
+@pytest.mark.parametrize("shift", [1.0, 4.0, -4.0])
+def test_the_colour_maps_rise_in_lightness(shift):
+    """In CIE lightness, for both signs and for one sign: in grey no two controls have the same shade."""
+    solution = made(plane().grid, lambda x: x[..., 0], lambda x: x[..., 1:] + shift)
+    rgb = plotting.policy(solution)[0].get_cmap()(np.linspace(0, 1, 33))[:, :3]
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     luminance = linear @ [0.2126, 0.7152, 0.0722]
-    steps = np.diff(116 * np.cbrt(luminance) - 16)
-    assert np.all(steps[:15] > 0)
-    assert np.all(steps[17:] * (1 if name == "viridis" else -1) > 0)
+    assert np.all(np.diff(116 * np.cbrt(luminance) - 16) > 0)
+
+
+def test_a_control_that_jumps_over_one_axis_is_drawn_as_steps():
+    grid = Grid([-1.0], [1.0], (21,))
+    (line,) = plotting.policy(made(grid, lambda x: x[..., 0], lambda x: -np.sign(x)))
+    assert line.get_drawstyle() == "steps-mid"
+    (smooth,) = plotting.policy(made(grid, lambda x: x[..., 0], lambda x: -x))
+    assert smooth.get_drawstyle() == "default"
+
+
+def test_value_and_time_have_the_names_of_the_problem():
+    problem, grid = zoo.eikonal(shape=(11, 11))
+    solution = made(grid, lambda x: x[..., 0], labels=problem.labels)
+    assert scale_label(plotting.value(solution)[0]) == "V = (1 − e⁻ᵝᵀ)/β"
+    path = path_of([[0.5, 0.0], [0.0, 0.0]])
+    assert [ax.get_xlabel() for ax in plotting.closed_loop(solution, path).figure.axes][-1] == "t [s]"
 
 
 def test_each_input_has_its_picture():

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
 
-FLAT = 1e-3  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
+FLAT = 1e-4  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
 OBSTACLE = "obstacle"  # the label of a set that is drawn solid
 HATCH, DOTS, STROKE = "////", "..", "#909090"
 EXTREME = 1e-6  # fraction of the range: a control closer to its end counts as being there

@@ -55,7 +55,7 @@ def test_a_market_of_firms(demand, slope, cost, decay, discount):
 @pytest.mark.parametrize(("lo", "hi"), [(-1.0, 2.0), (-0.3, 1.9)])
 def test_the_search_finds_the_root_that_scipy_finds(f, lo, hi):
     width = 1e-6 * (hi - lo)
-    search, count = root_search.start(lo, f(lo), hi, f(hi)), 2
+    search, count = root_search.begin_search(lo, f(lo), hi, f(hi)), 2
     while not root_search.is_done(search, width):
         x = float(root_search.proposal(search))
         assert lo < x < hi

@@ -137,9 +137,10 @@ def moon_landing(
 
     The target is the set where a soft landing requires full thrust, or more than full thrust; the value is prescribed
     there. The solver finds the coast; a path ends where the engine starts, and ``moon_landing_burn`` continues it to
-    the ground. To find the burn with ``pontryagin``, remove the target, ``dataclasses.replace(problem, target=None,
-    exit_cost=None)``, and pass ``terminal=[0, 0, nan]``. ``pontryagin`` does not know about the ground, so check h ≥ 0
-    along the path. States that rise close to the upper boundary h = 1.5 leave the box.
+    the ground. To find the burn with ``pontryagin``, remove the target,
+    ``dataclasses.replace(problem, target=None, exit_cost=None)``, and pass ``terminal=[0, 0, nan]``. ``pontryagin``
+    does not know about the ground, so check h ≥ 0 along the path. States that rise close to the upper boundary h = 1.5
+    leave the box.
 
     Args:
       thrust: U, the maximal thrust.

@@ -28,6 +28,7 @@ from hjbjax.problem.types import Field
 from hjbjax.solution.solution import Solution
 from hjbjax.solvers import factored_level, nested_grids
 from hjbjax.solvers.factored_level import Rows
+from hjbjax.solvers.rest_error import along, link_lengths
 
 SMOOTH = 0.5  # ratio of J to the same difference over two spacings; it is a quarter where the data are smooth
 LEAST = 1e-4  # fraction of the range of V: jumps that cost less on one move are not worth a linear solve
@@ -54,8 +55,8 @@ def error_at_discontinuities(solution: Solution, task: Task) -> np.ndarray | Non
 def _jumps(solution: Solution, task: Task, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mean error of the rate H on the moves from each node, per unit time, and its cost on one move, (*grid)."""
     grid, obstacles = task.grid, jax.device_get(task.obstacles)
-    # small programs compile fast: whatever is simple is computed here, and only the rates there
-    x = [np.reshape(np.asarray(grid.axis(axis), value.dtype), _along(grid, axis)) for axis in range(grid.ndim)]
+    # here in NumPy what needs no tracing, because small programs compile fast
+    x = [np.reshape(np.asarray(grid.axis(axis), value.dtype), along(grid, axis)) for axis in range(grid.ndim)]
     loose = np.broadcast_to(np.logical_not(obstacles.fixed), grid.shape)
     ways = [(axis, step) for axis in grid.state_axes for step in (-1, 1)]
     # beyond the boundary of a target nothing is paid, and a cost may be undefined there
@@ -120,19 +121,10 @@ def _missed_on(
     return jnp.where(counts, rate * jump, 0), rate
 
 
-def _along(grid: Grid, axis: int) -> list[int]:
-    """The shape of an array that varies along one axis only."""
-    return [-1 if i == axis else 1 for i in range(grid.ndim)]
-
-
 def _step(grid: Grid, axis: int, sign: float) -> np.ndarray:
     """The way to the next node along an axis, up or down, or zero; one number per node of the axis."""
-    nodes = np.asarray(grid.axis(axis))
-    if grid.periodic[axis]:
-        return np.reshape(np.full(nodes.shape, sign * float(grid.spacing(axis))), _along(grid, axis))
-    gaps = np.diff(nodes)
-    gaps = np.append(gaps, gaps[-1:]) if sign > 0 else np.append(gaps[:1], gaps)
-    return np.reshape(sign * gaps, _along(grid, axis))
+    up = link_lengths(grid, axis)
+    return np.reshape(sign * (up if sign > 0 else np.append(up[:1], up[:-1])), along(grid, axis))
 
 
 def _next_to(nodes: np.ndarray, grid: Grid, axis: int, step: int) -> np.ndarray:
@@ -148,9 +140,8 @@ def _slope(value: Field, grid: Grid, x: Field, axis: int) -> Field:
     if axis not in grid.state_axes:
         return jnp.zeros_like(value)
     if grid.periodic[axis]:
-        return (jnp.roll(value, -1, axis) - jnp.roll(value, 1, axis)) / (
-            2 * jnp.asarray(grid.spacing(axis), value.dtype)
-        )
+        width = 2 * jnp.asarray(grid.spacing(axis), value.dtype)
+        return (jnp.roll(value, -1, axis) - jnp.roll(value, 1, axis)) / width
     ahead, behind = (np.clip(np.arange(grid.shape[axis]) + step, 0, grid.shape[axis] - 1) for step in (1, -1))
     width = jnp.take(x, ahead, axis) - jnp.take(x, behind, axis)
     return (jnp.take(value, ahead, axis) - jnp.take(value, behind, axis)) / width

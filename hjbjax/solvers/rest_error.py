@@ -63,23 +63,27 @@ def error_at_rest(solution: Solution, task: Task, above: float) -> float:
       above: an estimate of the error; a third of it is the least error that is sought.
     """
     problem, grid, value = task.problem, task.grid, np.asarray(solution.value)
-    discount = problem.discount
-    if problem.cost is None or callable(discount) or not float(np.asarray(discount)) > 0 or problem.is_game:
-        return 0.0
-    if is_random(problem) or problem.growth is not None or grid.modes or solution.policy is None:
+    if solution.policy is None or grid.modes or not _may_rest(problem):
         return 0.0
     free = ~np.broadcast_to(np.asarray(task.obstacles.fixed), value.shape) & np.isfinite(value)
     if not free.any():
         return 0.0
-    policy, rate = np.asarray(solution.policy).reshape(value.size, -1), float(np.asarray(discount))
-    about = _Value(problem, grid, value, free, policy, rate)
+    policy = np.asarray(solution.policy).reshape(value.size, -1)
+    about = _Value(problem, grid, value, free, policy, float(np.asarray(problem.discount)))
     scale = np.max(value, where=free, initial=-np.inf) - np.min(value, where=free, initial=np.inf)
     found = _promising_links(about, max(above / 3, LEAST * float(scale)))
     return max((_largest_excess(about, *links) for links in found), default=0.0)
 
 
+def _may_rest(problem: Problem) -> bool:
+    """True if V ≤ L/β at every state where a control holds the state: no noise, one player, a constant discount."""
+    if problem.cost is None or problem.is_game or is_random(problem) or problem.growth is not None:
+        return False
+    return not callable(problem.discount) and float(np.asarray(problem.discount)) > 0
+
+
 def _promising_links(about: _Value, least: float) -> list[tuple[np.ndarray, int]]:
-    """For every axis the ``MOST`` links along which V_h may exceed L/β at rest by most: their lower nodes, (k,)."""
+    """For every axis the links where V_h − L/β at rest may be largest: their lower nodes, (k,), and the axis."""
     grid, found = about.grid, []
     for axis in range(grid.ndim):
         bends = _bends_along(about, axis)
@@ -100,12 +104,12 @@ def _promising_links(about: _Value, least: float) -> list[tuple[np.ndarray, int]
 
 
 def _bends_along(about: _Value, axis: int) -> np.ndarray:
-    """The second difference of L on the link from each node to the next along an axis, (*grid); −∞ where it is none."""
+    """The second difference of L between each node and the next along an axis, (*grid); −∞ where there is no next."""
     grid = about.grid
     nodes = (np.asarray(grid.axis(i), about.value.dtype) for i in range(grid.ndim))
-    x = [np.reshape(each, [-1 if i == k else 1 for i in range(grid.ndim)]) for k, each in enumerate(nodes)]
+    x = [np.reshape(each, along(grid, i)) for i, each in enumerate(nodes)]
     shift = [np.zeros_like(each) for each in x]
-    shift[axis] = np.reshape(_lengths(grid, axis), x[axis].shape).astype(x[axis].dtype)
+    shift[axis] = np.reshape(link_lengths(grid, axis), x[axis].shape).astype(x[axis].dtype)
     u = list(np.moveaxis(about.policy.reshape(*grid.shape, -1), -1, 0))
     bends = np.array(_bends(about.problem, x, shift, u))
     last = (slice(None),) * axis + (-1,)
@@ -146,7 +150,7 @@ def _largest_excess(about: _Value, nodes: np.ndarray, axis: int) -> float:
 def _moved(about: _Value, nodes: np.ndarray, states: np.ndarray, axis: int, share: float) -> np.ndarray:
     """States that are moved by a share of the link from each node to the next along an axis, (n, k)."""
     moved = states.copy()
-    moved[axis] += share * _lengths(about.grid, axis)[np.unravel_index(nodes, about.grid.shape)[axis]]
+    moved[axis] += share * link_lengths(about.grid, axis)[np.unravel_index(nodes, about.grid.shape)[axis]]
     return moved
 
 
@@ -246,7 +250,12 @@ def _states(grid: Grid, nodes: np.ndarray) -> np.ndarray:
     return np.stack([np.asarray(grid.axis(axis))[i] for axis, i in enumerate(np.unravel_index(nodes, grid.shape))])
 
 
-def _lengths(grid: Grid, axis: int) -> np.ndarray:
+def along(grid: Grid, axis: int) -> list[int]:
+    """The shape of an array that varies along one axis only."""
+    return [-1 if i == axis else 1 for i in range(grid.ndim)]
+
+
+def link_lengths(grid: Grid, axis: int) -> np.ndarray:
     """The distance from each node to the next along an axis; at the end of the box to the one before."""
     if grid.periodic[axis]:
         return np.full(grid.shape[axis], _spacing(grid, axis))

@@ -382,21 +382,16 @@ def check_division(problem: Problem, grid: Grid, counts: tuple[int, ...], caller
     Raises:
       ValueError: they cannot, or the problem or one of the choices works on one device only.
     """
-    own = None if problem.modes is None else problem.modes.switching_cost  # before the modes become an axis
-    for present, what, why in (
-        (
-            bool(problem.push_steps or problem.pushes),
-            "pushes",
-            "a node may be pushed through the nodes of several devices",
-        ),
-        (
-            any(each is not None for each in (own, problem.switching_costs)),
-            "a switching_cost",
-            "a node may change its mode several times",
-        ),
-        (problem.landings is not None or bool(problem.jumps), "jumps", "a jump may land on a node of any device"),
-    ):
-        if present:
-            raise ValueError(f"{caller}: got a mesh and a problem with {what}: {why}. Leave out mesh")
+    counts = (1, *counts) if grid.modes else counts
+    if problem.landings is not None or problem.jumps:
+        raise ValueError(
+            f"{caller}: got a mesh and a problem with jumps: a jump may land on a node of any device. Leave out mesh"
+        )
+    for axis, _ in (*problem.push_steps, *(push.step for push in problem.pushes)):
+        if axis < len(counts) and counts[axis] > 1:
+            raise ValueError(
+                f"{caller}: mesh divides axis {axis - bool(grid.modes)}, along which the problem has pushes: a node "
+                "may be\npushed through the nodes of several devices. Divide other axes, or leave out mesh"
+            )
     refuse_prescribed(grid, caller, "whose numbers are not divided over a mesh")
-    check_parts((1, *counts) if grid.modes else counts, grid.shape, caller, *choices)
+    check_parts(counts, grid.shape, caller, *choices)

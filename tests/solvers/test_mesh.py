@@ -25,7 +25,8 @@ DEAR = (
     "value_alone", "value_iteration_to_a_target", "value_iteration_of_a_game", "value_iteration_with_correlated_noise",
     "march_of_the_value_alone", "march_of_second_order", "march_of_fifth_order", "sweeps_of_flat_parts",
     "sweeps_in_slabs", "sweeps_to_a_target", "sweeps_of_a_game", "krylov", "krylov_with_correlated_noise",
-    "krylov_with_modes", "implicit_march", "open_ends", "without_a_choice", "three_integrators",
+    "krylov_with_modes", "krylov_with_switching_costs", "krylov_with_pushes", "sweeps_with_switching_costs",
+    "march_with_switching_costs", "implicit_march", "open_ends", "without_a_choice", "three_integrators",
 )  # fmt: skip
 EXACT = ("value_iteration", "march_of_first_order", *(name for name in DEAR if name.startswith(("value", "march"))))
 TO_A_TOLERANCE = (
@@ -214,7 +215,8 @@ def test_refusals(found):
         "traced march": ("ValueError: march: mesh divides the nodes at host level only", "jit"),
         "host": ("ValueError: solve: a function of the problem calls Python on the host", "leave out mesh"),
         "jumps": ("ValueError: solve: got a mesh and a problem with jumps", "Leave out mesh"),
-        "pushes": ("ValueError: solve: got a mesh and a problem with pushes", "Leave out mesh"),
+        "pushes": ("ValueError: solve: mesh divides axis 0, along which the problem has pushes", "Divide other axes"),
+        "pushes in modes": ("ValueError: solve: mesh divides axis 1, along which", "Divide other axes"),
         "no mesh of lanes": ("TypeError: solve_batch: mesh is 8", "jax.make_mesh"),
         "lanes to a file": ("ValueError: solve_batch: checkpoint= is not supported together with mesh=", "only one"),
         "lanes by the host": ("ValueError: solve_batch: a function of the problem calls Python on", "leave out mesh"),

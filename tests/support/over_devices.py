@@ -72,6 +72,9 @@ MODES = hjb.Problem(
     lambda x, u, mode: swing(x, (1.0, 0.2, 0.0)[mode] * u), lambda x, u, mode: effort(x, u) + 0.1 * mode, U, noise=0.6,
     discount=0.5, modes=hjb.Modes(("whole", "weak", "lost"), rates=[[0, 0.3, 0.1], [0.5, 0, 0.2], [0.4, 0, 0]]),
 )  # fmt: skip
+PRICES = np.array([[0.0, 0.2, 0.4], [0.1, 0.0, np.inf], [0.3, 0.2, 0.0]])
+REPAIRED = hjb.Modes(MODES.modes.names, MODES.modes.rates, switching_cost=lambda x: PRICES * (1.5 + jnp.sin(x[0])))
+SWITCHED = dataclasses.replace(MODES, modes=REPAIRED)  # the controller repairs what fails; dearer to the right
 STILL = {"drift": lambda x, u: 0 * x, "discount": 0.5}
 STEPS = {"method": hjb.ValueIteration(), "scheme": hjb.Upwind(), "max_steps": 40, "throw": False}
 
@@ -377,6 +380,28 @@ def krylov_with_modes():
 
 
 @case
+def krylov_with_switching_costs():
+    return within_certificates(SWITCHED, ANGLE, None, (4, 2))
+
+
+@case
+def sweeps_with_switching_costs():
+    return within_certificates(dataclasses.replace(SWITCHED, noise=None), ANGLE, None, (8,))
+
+
+@case
+def krylov_with_pushes():
+    """Pushes along the second axis in both directions; eight devices divide the first."""
+    pushes = [hjb.Push([0.0, 1.0], 0.4), hjb.Push([0.0, -1.0], lambda x: 0.3 + 0.1 * x[0] ** 2)]
+    return within_certificates(dataclasses.replace(SHAKEN, pushes=pushes), ANGLE, None, (8,))
+
+
+@case
+def march_with_switching_costs():
+    return beside(lambda mesh: hjb.march(SWITCHED, ANGLE, 0.3, scheme=hjb.Upwind(), mesh=mesh), (8,), (4, 2))
+
+
+@case
 def krylov_with_correlated_noise():
     return within_certificates(SKEW, FLAT, None, (4, 2))
 
@@ -512,6 +537,9 @@ def refusals():
         "host": lambda: hjb.solve(calling, FLAT, mesh=two),
         "jumps": lambda: hjb.solve(hjb.Problem(**STILL, jumps=[hjb.Jump(1.0, lambda x, u: -x)]), FLAT, mesh=two),
         "pushes": lambda: hjb.solve(hjb.Problem(**STILL, pushes=[hjb.Push([1.0, 0.0], 1.0)]), FLAT, mesh=two),
+        "pushes in modes": lambda: hjb.solve(
+            dataclasses.replace(SWITCHED, pushes=[hjb.Push([0.0, 1.0], 1.0)]), FLAT, mesh=mesh_of(2, 2)
+        ),
         "no mesh of lanes": lambda: hjb.solve_batch([PLAIN], FLAT, mesh=8),
         "lanes to a file": lambda: hjb.solve_batch([PLAIN], FLAT, mesh=two, checkpoint="run.npz"),
         "lanes by the host": lambda: hjb.solve_batch([PLAIN, calling], FLAT, mesh=two),

@@ -78,7 +78,7 @@ def _no_child(monkeypatch):
         (("--", "solve", "pendulum", "--set", "trque=2"), "did you mean 'torque'?"),
         (("--", "solve", "pendulum", "--set", "torque=-1"), "no admissible control: input 0 has lo = 1 > hi = -1"),
         (("--", "solve", "pendulum", "--scheme", "semi-lagrangian"), "runs on one device; leave out mesh"),
-        (("--", "solve", "thermostat"), "got a mesh and a problem with a switching_cost"),
+        (("--", "solve", "dividends"), "mesh divides axis 0, along which the problem has pushes"),
         (("--", "solve", "pendulum", "--dry-run", "--shape", "9"), "got 1 sizes, but pendulum has 2 axes"),
         (("--", "solve", "pendulm"), "did you mean 'pendulum'?"),
         (("--", "solve", "pendulum", "--tol", "nan"), "got 'nan', wanted a finite number > 0"),

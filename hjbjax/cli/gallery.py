@@ -90,7 +90,7 @@ def drawn_shape(shape: Sequence[int]) -> tuple[int, ...]:
 
     Example:
       >>> drawn_shape((121, 121)), drawn_shape((41, 40, 40)), drawn_shape((81,))
-      ((199, 199), (75, 74, 74), (81,))
+      ((201, 201), (75, 74, 74), (81,))
     """
     nodes = NODES.get(len(shape)) or min(MOST, math.prod(shape))
     share = (nodes / math.prod(shape)) ** (1 / len(shape))

@@ -125,7 +125,8 @@ def set_ticks(axis: Any, angle: bool, **options: Any) -> None:
     axis.set_major_locator(MaxNLocator(**(usual | options)))
     axis.set_major_formatter(FuncFormatter(number_text))
     room = min(max(axis.get_tick_space(), FEWEST), MOST)  # ticks that fit on the axis
-    step = angle_step(*axis.get_view_interval(), room) if angle else None
+    lo, hi = axis.get_view_interval()
+    step = angle_step(lo, hi, room) if angle else None
     if step is not None:
         axis.set_major_locator(MultipleLocator(step))
         axis.set_major_formatter(FuncFormatter(angle_text))

@@ -25,7 +25,8 @@ WORDY = 10  # characters next to each other above a colour bar; more are broken 
 FLAT = 1e-4  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
 OBSTACLE = "obstacle"  # the label of a set that is drawn solid
 HATCH, CROSSES, STROKE = "////", "xx", "#909090"
-DOTS = ("..", r"\\\\", "oo", "++")  # the patterns of sets where the state stops or is pushed, one per name
+# the patterns of sets where the state stops or is pushed, one per name; lines along a graph would hide it
+DOTS = ("..", "oo", "++", r"\\\\")
 EXTREME = 1e-6  # fraction of the range: a control closer to its end counts as being there
 JUMPING = 0.9  # fraction of nodes at an end of the range, or at zero, that identifies a feedback that jumps
 

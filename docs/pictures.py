@@ -93,8 +93,10 @@ def shrink(picture: Path) -> None:
 
 
 def write_pictures(card: gallery.Card, folder: Path) -> None:
-    """Write the pictures of a ready problem into a folder."""
+    """Write the pictures of a ready problem into a folder, instead of its old ones."""
     folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob(f"{card.name}-[0-9].webp"):
+        old.unlink()
     for number, (_, data) in enumerate(card.pictures, 1):
         (folder / f"{card.name}-{number}.webp").write_bytes(data)
 
@@ -104,14 +106,15 @@ def gallery_page(cards: list[gallery.Card]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Every ready problem of `hjb.zoo`, solved on a small grid by `python -m docs pictures`.",
+        "Every ready problem of `hjb.zoo`, solved on a grid for pictures by `python -m docs pictures`.",
         "`hjbjax gallery --out FOLDER` makes this page on your machine. `hjbjax solve NAME` solves one problem on its",
-        "full grid.",
+        "own grid.",
         "",
     ]
     for card in cards:
         lines += [f"## {card.name}", "", f"{card.summary[0].upper()}{card.summary[1:]}: {card.status}.", ""]
         for number, (caption, _) in enumerate(card.pictures, 1):
             lines += [f"![{card.name}: {caption}](pictures/gallery/{card.name}-{number}.webp)", ""]
+            lines += [f"*{caption[0].upper()}{caption[1:]}.*", ""]
         lines += ["| | |", "|---|---|", *(f"| {word} | {figure} |" for word, figure in card.facts), ""]
     return "\n".join(lines)

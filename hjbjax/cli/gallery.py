@@ -1,7 +1,7 @@
 """The gallery, a page of all ready problems: pictures, numbers, and the error if the exact answer is known.
 
-Each problem is solved on a small grid and becomes a ``Card``. ``page`` builds one self-contained HTML file of the
-cards, with embedded pictures.
+Each problem is solved on a grid for pictures and becomes a ``Card``. ``page`` builds one self-contained HTML file of
+the cards, with embedded pictures.
 """
 
 from __future__ import annotations
@@ -25,9 +25,7 @@ from hjbjax._version import __version__
 from hjbjax.cli import run_folder
 from hjbjax.cli.command_line import text_of
 from hjbjax.feedback.path import Path as Trajectory
-from hjbjax.plotting.slices import feedback
 from hjbjax.problem.labels import COST
-from hjbjax.problem.mode_axis import without_modes
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution import placement
 from hjbjax.solution.solution import Solution, SolveError, Status
@@ -40,10 +38,10 @@ if TYPE_CHECKING:
     from hjbjax.zoo.entry import Entry
 
 PAGE = "index.html"
-NODES = 20_000  # maximum per problem: tenths of a second once compiled; with 62 x 63 the pendulum is 3 % off
+# number of nodes by number of states: cells of two to four pixels over two axes, in seconds once compiled
+NODES = {2: 40_000, 3: 400_000}
+MOST = 20_000  # for other numbers of states
 DPI = 100  # as in the other pages; labels of 9 points are legible
-NEARLY = 0.99  # share of the nodes
-QUALITY = 85  # WebP quality: 12 kB per picture; with 60 it is 8 kB, but edges of shaded fields fray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,21 +82,23 @@ def check_page_folder(out: Path, force: bool = False) -> None:
         raise FileExistsError(f"{out} is not empty: {shown}; give another --out, or --force to add {PAGE} to them")
 
 
-def small_shape(shape: Sequence[int]) -> tuple[int, ...]:
-    """The shape of a grid with about ``NODES`` nodes and the proportions of ``shape``, or ``shape`` if it is smaller.
+def drawn_shape(shape: Sequence[int]) -> tuple[int, ...]:
+    """The shape of a grid with the proportions of ``shape`` that is fine enough for pictures and solved in seconds.
 
-    The parity of each count is kept: an odd count has a node at zero, and an even periodic axis has antipodal nodes.
+    Over two and three axes it has about ``NODES`` nodes, otherwise at most ``MOST``. The parity of each count is kept:
+    an odd count has a node at zero, and an even periodic axis has antipodal nodes.
 
     Example:
-      >>> small_shape((200, 201)), small_shape((41, 51, 41)), small_shape((81,))
-      ((142, 141), (25, 31, 25), (81,))
+      >>> drawn_shape((121, 121)), drawn_shape((41, 40, 40)), drawn_shape((81,))
+      ((201, 201), (75, 74, 74), (81,))
     """
-    share = min(1.0, (NODES / math.prod(shape)) ** (1 / len(shape)))
+    nodes = NODES.get(len(shape)) or min(MOST, math.prod(shape))
+    share = (nodes / math.prod(shape)) ** (1 / len(shape))
     return tuple(count - 2 * round(count * (1 - share) / 2) for count in shape)
 
 
 def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
-    """Solve one problem on its small grid and plot it; an error gives a card as well.
+    """Solve one problem on a grid for pictures and plot it; an error gives a card as well.
 
     Args:
       entry: an entry of the catalogue.
@@ -112,7 +112,7 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
     import hjbjax as hjb
 
     _, grid = entry.build()
-    problem, grid = entry.build(shape=small_shape(grid.shape))
+    problem, grid = entry.build(shape=drawn_shape(grid.shape))
     try:
         # put warnings on the card instead of the terminal, which shows one line per problem
         with warnings.catch_warnings(record=True) as heard:
@@ -125,6 +125,8 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
         raise KeyboardInterrupt
     pictures, path = _figures(problem, solution, entry)
     facts = [*_facts(solution), *_exact(entry, solution)]
+    if constants := _constants(solution, dict(enumerate(entry.initial_state(len(solution.grid.state_axes))[2:], 2))):
+        facts.append(("constant feedback", ", ".join(constants)))
     if path is not None:
         promised = "" if path.promised is None else f"; V at its start {float(path.promised):.4g}"
         paid = path.cost if path.payoff == COST else path.reward
@@ -148,28 +150,29 @@ def _figures(problem: Problem, solution: Solution, entry: Entry) -> tuple[list[t
     if path is None or states == 1 or solution.grid.modes:  # otherwise the figure of the loop shows the value
         drawn.append(("the value", run_folder.plot_values(problem, solution, fixed, jumps)))
     if path is not None:
-        figure = run_folder.figure_of(plotting.maps.closed_loop_size(without_modes(solution.grid)))
+        figure = run_folder.figure_of(plotting.maps.closed_loop_size(solution, path))
         target = run_folder.target_in(problem, entry.mode)
         plotting.closed_loop(solution, path, fixed=fixed, target=target, figure=figure)
         drawn.append(("the closed loop" if states == 1 else "the value, and the closed loop on it", figure))
-    if solution.policy.shape[-1] and not _is_constant(solution, fixed):
+    if len(_constants(solution, fixed)) < solution.policy.shape[-1]:
         drawn.append(("the feedback", run_folder.plot_policies(problem, solution, fixed, jumps)))
     return drawn, path
 
 
-def _is_constant(solution: Solution, fixed: dict[int, float]) -> bool:
-    """True if the feedback of one input is the same at nearly all nodes of a cut: a picture of one colour."""
-    if not fixed or solution.policy.shape[-1] != 1:
-        return False
-    section, _ = feedback(solution, 0, fixed, None)
-    known = section.values.compressed()
-    return bool(known.size) and float(np.mean(np.isclose(known, np.median(known)))) > NEARLY
+def _constants(solution: Solution, fixed: dict[int, float]) -> list[str]:
+    """The inputs of the feedback that do not vary in the pictures, with their numbers."""
+    count = solution.policy.shape[-1]
+    found = {i: run_folder.constant_input(solution, i, fixed) for i in range(count)}
+    return [f"{solution.labels.control(i, count)} = {number:.4g}" for i, number in found.items() if number is not None]
 
 
 def webp(figure: Figure) -> bytes:
-    """A figure as a WebP file."""
+    """A figure as a WebP file.
+
+    It is lossless, because lossy compression draws stripes and blocks on smooth shades.
+    """
     stream = io.BytesIO()
-    figure.savefig(stream, format="webp", dpi=DPI, pil_kwargs={"quality": QUALITY, "method": 6})
+    figure.savefig(stream, format="webp", dpi=DPI, pil_kwargs={"lossless": True, "quality": 100, "method": 6})
     return stream.getvalue()
 
 
@@ -232,8 +235,8 @@ def page(cards: Sequence[Card]) -> str:
         # an empty icon, otherwise a browser requests /favicon.ico
         '<link rel="icon" href="data:,"><meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<style>{STYLE}</style></head>\n<body><h1>The ready problems of hjbjax</h1>\n"
-        f"<p>{good} of {len(cards)} converged, by hjbjax {__version__} on {html.escape(_device())}, at most about "
-        f"{NODES:,} nodes each. <code>hjbjax solve NAME</code> takes the full grids.</p>\n"
+        f"<p>{good} of {len(cards)} converged, by hjbjax {__version__} on {html.escape(_device())}, on grids for "
+        "pictures. <code>hjbjax solve NAME</code> takes the grid of the problem.</p>\n"
         f"<nav>{links}</nav>\n{''.join(map(_section, cards))}</body></html>\n"
     )
 

@@ -29,11 +29,12 @@ from hjbjax.feedback.path import join_paths
 from hjbjax.feedback.simulation import simulate
 from hjbjax.plotting.maps import closed_loop_size
 from hjbjax.plotting.slices import at_states
+from hjbjax.plotting.slices import feedback as feedback_of
 from hjbjax.plotting.style import NARROW, save_figure
 from hjbjax.problem import streams
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
-from hjbjax.problem.mode_axis import in_mode, without_modes
+from hjbjax.problem.mode_axis import in_mode
 from hjbjax.problem.problem import Problem, is_random
 from hjbjax.problem.sets import Ball, Box, Simplex
 from hjbjax.solution import placement
@@ -48,6 +49,7 @@ FILES = ("solution.npz", "value.png", "policy.png", "trajectory.png")
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | float | bool | None"  # the types of JSON
 SAMPLES = 400  # most samples of a bang-bang feedback along its trajectory
 FEWEST = 40  # fewest samples; with fewer the path would pass a small target
+CONSTANT, NEARLY = 1e-3, 0.99  # relative variation of a constant feedback, and the fraction of its nodes
 DPI = 160
 NAME = 40  # characters of a folder's name that are repeated in the name of a new folder next to it
 
@@ -211,7 +213,7 @@ def make(
     if solution.status == Status.CONVERGED:  # a closed loop with an unfinished feedback would be misleading
         path = closed_path(problem, solution, start, duration, jumps, finish, mode)
     if path is not None:
-        figure = figure_of(closed_loop_size(without_modes(solution.grid)))
+        figure = figure_of(closed_loop_size(solution, path))
         loop = plotting.closed_loop(solution, path, fixed=fixed, target=target_in(problem, mode), figure=figure)
         loop.save(folder / "trajectory.png", dpi=DPI)
         yield "trajectory.png", path
@@ -338,8 +340,9 @@ def plot_values(problem: Problem, solution: Solution, fixed: dict[int, float], j
 
 
 def plot_policies(problem: Problem, solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
-    """One plot per input and, over two states, per mode, side by side."""
+    """One plot per input and, over two states, per mode, side by side; without constant feedbacks if others vary."""
     inputs = [(part, input) for input in range(solution.policy.shape[-1]) for part in _parts(problem, solution)]
+    inputs = [each for each in inputs if constant_input(each[0].solution, each[1], fixed) is None] or inputs
     figure, axes_of_inputs = _panels([part.title for part, _ in inputs])
     if not inputs:
         figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")
@@ -348,6 +351,20 @@ def plot_policies(problem: Problem, solution: Solution, fixed: dict[int, float],
         with_curve(drawn, part.solution, fixed, jumps, input)
         _name_mode(ax, part.title)
     return figure
+
+
+def constant_input(solution: Solution, input: int, fixed: dict[int, float]) -> float | None:
+    """The number that one input of the feedback has at nearly all nodes of a cut, of every mode; ``None`` if it varies.
+
+    Its picture would have one colour, or be a horizontal line.
+    """
+    modes = solution.grid.modes
+    parts = [solution.in_mode(mode) for mode in modes] if modes else [solution]
+    known = np.concatenate([feedback_of(part, input, fixed, None)[0].values.compressed() for part in parts])
+    if known.size == 0:
+        return None
+    middle = float(np.median(known))
+    return middle if float(np.mean(np.abs(known - middle) <= CONSTANT * abs(middle))) > NEARLY else None
 
 
 def _name_mode(ax: "Axes", mode: str) -> None:

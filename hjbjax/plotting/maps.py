@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hjbjax.plotting.histories import controls
+from hjbjax.plotting.histories import inputs_over_time, modes_over_time, states_over_time
 from hjbjax.plotting.modes import by_mode
-from hjbjax.plotting.scales import is_angle, scale_axes, set_ticks, time_label
-from hjbjax.plotting.shading import Look, dot_region, draw, fill_missing, frame, is_level, jumps
+from hjbjax.plotting.scales import scale_axes, time_label
+from hjbjax.plotting.shading import EXTREME, Look, cross_out, dot_region, draw, fill_missing, frame, is_level, jumps
 from hjbjax.plotting.slices import (
     Cuts,
     Region,
     Section,
     at_states,
     at_time,
+    closed_field,
     decided_sets,
     described,
     feedback,
     line_in_box,
+    near_ends,
     region_of,
     section_of,
     span_of,
@@ -34,6 +35,10 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Number, State
 
 SMOOTHING = 1.5  # width of the mean of signs at a switching curve, in cells
+TIE = 0.3  # relative difference between the neighbours of an extremum of V that is within 0.15 cells of the node
+BANG_BANG = 0.98  # fraction of nodes at an end of the range; the others are on a switching curve
+SURE = 0.999  # mean of signs beyond which all neighbours have one sign
+DIGITS = 9  # of a mean of signs
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -59,6 +64,8 @@ def value(
     """Plot the value function: a line over one axis, colours with contour lines over two axes.
 
     The set where it is optimal to stop, or to push, is dotted, up to the free boundary; see ``Solution.free_boundary``.
+    Over two axes the nodes where the ends of the box change V by more than 1 % of its range are crossed out; see
+    ``Solution.box_error``.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
@@ -97,6 +104,7 @@ def value(
     hidden = "V = ∞" if np.all(np.isposinf(lost)) else "V = −∞" if np.all(np.isneginf(lost)) else "V not finite"
     section, regions = _without(section, target_of(solution, time) if target is None else target)
     artists = draw(ax, section, Look(name, hidden, colorbar), regions) + _stopped(ax, solution, section, time)
+    artists += cross_out(ax, section, near_ends(solution, section, time) & ~np.ma.getmaskarray(section.values))
     lines = _levels(section.values, levels) if len(section.axes) == 2 else ()
     if len(lines):
         shades = fill_missing(section.values).T
@@ -161,8 +169,23 @@ def policy(
     idle = np.any([inside for inside, _ in decided.values()], axis=0) if decided else None
     look = Look(label, hidden, colorbar, diverging=True, cells=cells, span=span, idle=idle)
     artists = draw(ax, section, look, regions)
+    if cells and not described(solution).discrete and len(section.axes) == 2:
+        artists += _smooth_edge(ax, artists[0], section, _ties(solution, section, time))
     artists += [each for name, found in decided.items() for each in dot_region(ax, section, *found, name, cover=True)]
+    artists += cross_out(ax, section, near_ends(solution, section, time) & ~np.ma.getmaskarray(section.values))
     return Picture(artists, ax)
+
+
+def _smooth_edge(ax: Axes, mesh: Any, section: Section, tied: np.ndarray) -> list[Artist]:
+    """Draw the edge between the cells of the two controls of a bang-bang feedback smoothly, as ``switching_curve``."""
+    known = section.values.compressed()
+    lo, hi = float(known.min()), float(known.max())
+    near = EXTREME * (hi - lo)
+    if not lo < 0 < hi or np.mean((known <= lo + near) | (known >= hi - near)) < BANG_BANG:
+        return []
+    colours = [mesh.cmap(mesh.norm(end)) for end in (lo, hi)]
+    level = _mean_signs(section, tied)
+    return [ax.contourf(*section.coordinates, level.T, levels=[-SURE, 0.0, SURE], colors=colours, zorder=1)]
 
 
 @drawing
@@ -180,8 +203,9 @@ def switching_curve(
 
     A bang-bang feedback jumps between two nodes, so the curve is accurate to half a cell. Its signs are averaged over
     the neighbours before the zero level is drawn, otherwise the curve would be a staircase of half cells. A continuous
-    feedback crosses zero without a switch, and its curve is arbitrary where the feedback is nearly zero. Over one axis
-    the zeros are drawn as vertical lines.
+    feedback crosses zero without a switch, and its curve is arbitrary where the feedback is nearly zero. A node that is
+    a maximum or a minimum of V between two signs is on the curve: there both signs are equally good. Over one axis the
+    zeros are drawn as vertical lines.
 
     Args:
       solution: the solution of ``solve`` or ``march``.
@@ -206,7 +230,7 @@ def switching_curve(
         artists: list[Artist] = [ax.axvline(x, **style) for x in zeros(section.coordinates[0], section.values)]
     else:
         x, y = section.coordinates
-        level = _mean_signs(section.values) if jumps(known) else section.values
+        level = _mean_signs(section, _ties(solution, section, time)) if jumps(known) else section.values
         artists = [ax.contour(x, y, level.T, levels=[0.0], colors=color, linewidths=1.6)]
     frame(ax, section)
     if label:  # on an empty line, because contours cannot have a label
@@ -215,14 +239,49 @@ def switching_curve(
     return Picture(artists, ax)
 
 
-def _mean_signs(values: np.ma.MaskedArray) -> np.ma.MaskedArray:
+def _ties(solution: Solution, section: Section, time: float | None) -> np.ndarray:
+    """The nodes of a section over two axes that are an extremum of V along an axis, between different signs; bool."""
+    field = at_time(solution, solution.value, time)[0]
+    value = section_of("value", field, section.grid, section.cuts, "").values.filled(np.nan)
+    signs = np.sign(section.values.filled(np.nan))
+    tied = np.zeros(value.shape, bool)
+    for position, axis in enumerate(section.axes):
+        periodic = bool(section.grid.periodic[axis])
+        (below, above), (left, right) = (_neighbours(each, position, periodic) for each in (value, signs))
+        steps = np.abs(value - below) + np.abs(value - above)
+        extreme = ((value - below) * (value - above) > 0) & (np.abs(above - below) <= TIE * steps)
+        tied |= extreme & (left * right < 0)  # False for NaN
+    return tied
+
+
+def _neighbours(values: np.ndarray, axis: int, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The values at both neighbours along an axis; NaN beyond an end."""
+    places = np.arange(values.shape[axis])
+    if periodic:  # the last row repeats the first one
+        cells = len(places) - 1
+        return np.take(values, (places - 1) % cells, axis), np.take(values, (places + 1) % cells, axis)
+    wide = np.pad(values, [(1, 1) if i == axis else (0, 0) for i in range(values.ndim)], constant_values=np.nan)
+    return np.take(wide, places, axis), np.take(wide, places + 2, axis)
+
+
+def _mean_signs(section: Section, tied: np.ndarray) -> np.ma.MaskedArray:
     """Signs averaged over the known neighbours with Gaussian weights; the zero level at a straight line is straight."""
     from scipy.ndimage import gaussian_filter
 
-    mask = np.ma.getmaskarray(values)
-    signs = np.where(mask, 0.0, np.sign(values))
-    total, weight = (gaussian_filter(field, SMOOTHING, mode="nearest") for field in (signs, 1.0 - mask))
-    return np.ma.array(total / np.where(mask, 1.0, weight), mask=mask)
+    values, mask = section.values, np.ma.getmaskarray(section.values)
+    signs = np.where(mask | tied, 0.0, np.sign(values.filled(0.0)))
+    modes = ["grid-wrap" if section.grid.periodic[axis] else "nearest" for axis in section.axes]
+    total, weight = (
+        closed_field(gaussian_filter(_open(field, section), SMOOTHING, mode=modes), section.grid, section.axes)
+        for field in (signs, 1.0 - mask)
+    )
+    # rounded, otherwise a curve along a face of the box would be broken by rounding errors
+    return np.ma.array(np.round(total / np.where(mask, 1.0, weight), DIGITS), mask=mask)
+
+
+def _open(field: np.ndarray, section: Section) -> np.ndarray:
+    """A field over two axes without the repeated row at the upper end of each periodic axis."""
+    return field[tuple(slice(None, -1 if section.grid.periodic[axis] else None) for axis in section.axes)]
 
 
 @drawing
@@ -259,20 +318,13 @@ def trajectory(
     """
     from matplotlib.patheffects import Normal, Stroke
 
-    times, states = np.asarray(path.times), np.asarray(path.states)
+    states = np.asarray(path.states)
     count = states.shape[1]
     names = tuple(names or (grid.labels if grid is not None else (f"x{i + 1}" for i in range(count))))
     states = without_jumps(states, grid)
     if axes is None or count == 1:
         ax = axes_of(ax, wide=True)
-        colours = itertools.cycle((color,) if color else COLOURS)
-        artists: list[Artist] = [
-            ax.plot(times, states[:, i], color=next(colours), label=names[i])[0] for i in range(count)
-        ]
-        label_axes(ax, time_label(grid), names[0] if count == 1 else "state")
-        set_ticks(ax.xaxis, False)
-        set_ticks(ax.yaxis, count == 1 and grid is not None and is_angle(grid, 0))
-        return Picture(artists if count == 1 else [*artists, legend(ax)], ax)
+        return Picture(states_over_time(ax, path, names, range(count), grid, color), ax)
     if len(axes) != 2 or not all(0 <= i < count for i in axes):
         raise ValueError(f"trajectory: got axes={axes!r}; the path has {count} states, wanted two of 0 to {count - 1}")
     ax = axes_of(ax)
@@ -281,8 +333,9 @@ def trajectory(
     plane = line_in_box(states, axes, grid)
     color = color or COLOURS[1]
     casing = [Stroke(linewidth=3.4, foreground="white"), Normal()]  # a white border, visible on any colour
-    artists = [*ax.plot(*plane.T, color=color, linewidth=1.8, label=label, path_effects=casing, zorder=4)]
+    artists: list[Artist] = [*ax.plot(*plane.T, color=color, linewidth=1.8, label=label, path_effects=casing, zorder=4)]
     marks: dict[str, Any] = {"linestyle": "none", "marker": "o", "markeredgecolor": color, "markersize": 6, "zorder": 5}
+    marks["clip_on"] = grid is None  # on a face of the box all of the mark is drawn
     artists += ax.plot(*first, markerfacecolor="white", markeredgewidth=1.6, **marks)
     artists += ax.plot(*last, markerfacecolor=color, path_effects=casing, **marks)
     label_axes(ax, names[axes[0]], names[axes[1]])
@@ -318,13 +371,15 @@ def closed_loop(
     Returns:
       The picture: the artists of the value first.
     """
-    if solution.grid.modes:
+    modes = solution.grid.modes
+    if modes:
         solution = solution.in_mode(int(np.asarray(path.modes)[0]))
     grid = solution.grid
     artists: list[Artist] = []
-    plane, driven = grid.ndim > 1, np.shape(path.controls)[1] > 0
-    figure = figure or new_figure(closed_loop_size(grid))
-    columns = figure.add_gridspec(1 + driven, 1 + plane, width_ratios=(1.25, 1.0)[: 1 + plane])
+    figure = figure or new_figure(closed_loop_size(solution, path))
+    rows = _rows(solution, path)
+    plane = grid.ndim > 1
+    columns = figure.add_gridspec(len(rows), 1 + plane, width_ratios=(1.25, 1.0)[: 1 + plane])
     if plane:
         start = np.asarray(path.states)[0]
         # the path may leave this plane in its other states; its projection is drawn on the section
@@ -332,20 +387,46 @@ def closed_loop(
         ax = styled(figure.add_subplot(columns[:, 0]))
         artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed, target=target)
         # a section has its axes in the order of the grid
-        artists += trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
-    upper = styled(figure.add_subplot(columns[0, -1]))
-    artists += trajectory(path, ax=upper, axes=None, grid=grid)
-    upper.set_xlabel("" if driven else time_label(grid, described(solution).labels))
-    if driven:  # the lower axes have the label of the time
-        lower = styled(figure.add_subplot(columns[1, -1], sharex=upper))
-        artists += controls(path, ax=lower, solution=solution)
-        upper.tick_params(labelbottom=False)
-    return Picture(artists, ax if plane else upper)
+        drawn = trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
+        for mark, name in zip(drawn, ("path", "start", "end"), strict=True):
+            mark.set_label(name)
+        legend(ax)
+        artists += drawn
+    panels: list[Axes] = []
+    for number, (kind, chosen) in enumerate(rows):
+        panels.append(styled(figure.add_subplot(columns[number, -1], sharex=panels[0] if panels else None)))
+        if kind == "state":
+            artists += states_over_time(panels[-1], path, grid.labels, chosen, grid)
+        elif kind == "control":
+            artists += inputs_over_time(panels[-1], path, chosen, solution)
+        else:
+            artists += modes_over_time(panels[-1], path, modes)
+    for panel in panels:  # a label with its unit is longer than one of several axes is high
+        panel.set_ylabel(panel.get_ylabel().replace(" [", "\n[") if len(panels) > 2 else panel.get_ylabel())
+    figure.align_ylabels(panels)
+    for panel in panels[:-1]:  # the lowest axes have the label of the time
+        panel.set_xlabel("")
+        panel.tick_params(labelbottom=False)
+    panels[-1].set_xlabel(time_label(grid, described(solution).labels))
+    return Picture(artists, ax if plane else panels[0])
 
 
-def closed_loop_size(grid: Grid) -> tuple[float, float]:
+def _rows(solution: Solution, path: Path) -> list[tuple[str, list[int]]]:
+    """The plots over time from top to bottom: the states and then the inputs of each unit, and the mode."""
+    units = described(solution).labels.control_units
+    count = np.shape(path.controls)[1]
+    groups = {"state": solution.grid.units, "control": units or ("",) * count}
+    rows = []
+    for kind, names in groups.items():
+        for unit in dict.fromkeys(names):  # in the order in which they appear
+            rows.append((kind, [i for i, name in enumerate(names) if name == unit]))
+    return rows + [("mode", [])] * (getattr(path, "modes", None) is not None)
+
+
+def closed_loop_size(solution: Solution, path: Path) -> tuple[float, float]:
     """The size of the figure of a closed loop in inches, with room for a plane if there are two states or more."""
-    return (9.6 if grid.ndim > 1 else 5.4), 4.2
+    states = len(solution.grid.state_axes)
+    return (9.6 if states > 1 else 5.4), max(4.2, 1.4 * len(_rows(solution, path)))
 
 
 def _levels(values: np.ma.MaskedArray, levels: int | Sequence[float]) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""Pictures of solutions with modes: one mode, or over one state all modes in one picture."""
+"""Pictures of solutions with modes: one mode, or over one state all modes in one picture.
+
+Over one state each mode has its own line, and its sets, such as a push region, have the colour of the line and a
+name that includes the mode.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from hjbjax.plotting.slices import Cuts
-from hjbjax.plotting.style import COLOURS, Picture, axes_of, legend
+from hjbjax.plotting.style import Picture, axes_of, legend, line_look
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+
     from hjbjax.solution.solution import Solution
 
 T = TypeVar("T", bound="Callable[..., Picture]")
@@ -50,12 +56,22 @@ def by_mode(draw: T) -> T:
         ax, artists = axes_of(options.get("ax")), []
         for number, name in enumerate(modes):
             picture: Any = draw(solution.in_mode(number), *arguments, **(options | {"ax": ax}))
-            line = picture[0]
-            line.set_color(COLOURS[number % len(COLOURS)])
-            line.set_label(name)
+            line, *sets = picture
+            line.set(label=name, **line_look(number))
+            for each in sets:
+                _name_mode(each, name, number)
             artists += list(picture)
         ax.relim()
         ax.autoscale(axis="y")
         return Picture([*artists, legend(ax)], ax)
 
     return cast(T, drawn)
+
+
+def _name_mode(band: Artist, mode: str, number: int) -> None:
+    """Give a set of one mode the colour of its line, and add the mode to its name, if it has one."""
+    # without a face, because the sets of two modes may overlap
+    band.set(facecolor="none", edgecolor=line_look(number)["color"])
+    label = str(band.get_label())
+    if not label.startswith("_"):  # matplotlib's own labels, which are not in a legend
+        band.set_label(f"{label}, {mode}")

@@ -19,7 +19,7 @@ LENGTHS = ("m", "km", "cm", "mm", "µm", "um", "nm", "ft", "in", "mi", "nmi", "n
 ANGLES = ("rad", "radian", "radians")
 ROUND = (1, 2, 5, 10)  # leading digits of tick spacings; with 2.5 labels such as −0.75 and −0.5 touch
 NAMELESS = Labels()
-FEWEST, MOST = 3, 7  # ticks of an angle; with fewer, decimals are better than fractions of π
+FEWEST, MOST = 3, 7  # ticks of an axis; an angle with fewer multiples of π has decimals
 STEPS = [Fraction(1, 4), Fraction(1, 2), *(Fraction(2**k) for k in range(12))]  # tick spacings, in multiples of π
 
 
@@ -121,23 +121,26 @@ def set_ticks(axis: Any, angle: bool, **options: Any) -> None:
     """
     from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
-    axis.set_major_locator(MaxNLocator(**({"nbins": "auto", "steps": ROUND} | options)))
+    usual: dict[str, Any] = {"nbins": "auto", "steps": ROUND, "min_n_ticks": FEWEST}
+    axis.set_major_locator(MaxNLocator(**(usual | options)))
     axis.set_major_formatter(FuncFormatter(number_text))
-    step = angle_step(*axis.get_view_interval()) if angle else None
+    room = min(max(axis.get_tick_space(), FEWEST), MOST)  # ticks that fit on the axis
+    lo, hi = axis.get_view_interval()
+    step = angle_step(lo, hi, room) if angle else None
     if step is not None:
         axis.set_major_locator(MultipleLocator(step))
         axis.set_major_formatter(FuncFormatter(angle_text))
 
 
-def angle_step(lo: float, hi: float) -> float | None:
-    """The spacing of the ticks of an angle, a multiple of π; ``None`` if there would be too few or too many ticks.
+def angle_step(lo: float, hi: float, most: int = MOST) -> float | None:
+    """The spacing of up to ``most`` ticks of an angle, a multiple of π; ``None`` if there would be too few or too many.
 
     Example:
       >>> angle_step(-math.pi, math.pi) == math.pi / 2
       True
     """
     turns = abs(hi - lo) / math.pi
-    fitting = [step for step in STEPS if FEWEST <= math.floor(turns / step + 1e-9) + 1 <= MOST]
+    fitting = [step for step in STEPS if FEWEST <= math.floor(turns / step + 1e-9) + 1 <= most]
     return float(fitting[0]) * math.pi if fitting else None
 
 

@@ -21,9 +21,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
 
+WORDY = 10  # characters next to each other above a colour bar; more are broken at the equals sign
 FLAT = 1e-4  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
 OBSTACLE = "obstacle"  # the label of a set that is drawn solid
-HATCH, DOTS, STROKE = "////", "..", "#909090"
+HATCH, CROSSES, STROKE = "////", "xx", "#909090"
+# the patterns of sets where the state stops or is pushed, one per name; lines along a graph would hide it
+DOTS = ("..", "oo", "++", r"\\\\")
 EXTREME = 1e-6  # fraction of the range: a control closer to its end counts as being there
 JUMPING = 0.9  # fraction of nodes at an end of the range, or at zero, that identifies a feedback that jumps
 
@@ -73,7 +76,7 @@ def draw(ax: Axes, section: Section, look: Look, regions: tuple[Region, ...] = (
     else:
         frame(ax, section)
         artists = _mesh(ax, section, look, regions)
-    if (look.hidden and mask.any()) or any(region.visible for region in regions):
+    if ax.get_legend_handles_labels()[1]:
         legend(ax)
     return artists
 
@@ -208,6 +211,8 @@ def dot_region(
 ) -> list[Artist]:
     """Dot the part of a section where it is optimal to stop or push, up to the free boundary, and name it.
 
+    A second set on the same axes has another pattern than dots.
+
     Args:
       inside: True for nodes of the set, of the shape of the section.
       values: V at the same nodes.
@@ -221,16 +226,16 @@ def dot_region(
 
     if not inside.any():
         return []
-    style: dict[str, Any] = {"facecolor": "none", "edgecolor": STROKE, "hatch": DOTS}
+    pattern = _pattern(ax)
+    style: dict[str, Any] = {"facecolor": "none", "edgecolor": STROKE, "hatch": pattern}
     artists: list[Artist] = []
-    named = name in ax.get_legend_handles_labels()[1]  # several modes may be drawn on the same axes
     if len(section.axes) == 1:
         (x,) = section.coordinates
         ends = [*x[:1][inside[:1]], *points_of(x, values, inside, None), *x[-1:][inside[-1:]]]
         for k, (left, right) in enumerate(zip(ends[::2], ends[1::2], strict=True)):
-            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k or named else name, **style))
+            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k else name, **style))
     else:
-        area: Any = {"levels": [0.0, 1.0], "colors": "white" if cover else "none", "hatches": [DOTS], "zorder": 2}
+        area: Any = {"levels": [0.0, 1.0], "colors": "white" if cover else "none", "hatches": [pattern], "zorder": 2}
         dots = ax.contourf(*section.coordinates, inside.T - 0.5, **area)
         dots.set(edgecolor=STROKE, linewidth=0.0)
         segments = segments_of(section.coordinates, values, inside, (None, None))
@@ -241,6 +246,29 @@ def dot_region(
     return artists
 
 
+def cross_out(ax: Axes, section: Section, nodes: np.ndarray) -> list[Artist]:
+    """Cross out the part of a section over two axes where the ends of the box change V, and name it."""
+    from matplotlib.patches import Rectangle
+
+    if len(section.axes) == 1 or not nodes.any():
+        return []
+    area = ax.contourf(
+        *section.coordinates, nodes.T - 0.5, levels=[0.0, 1.0], colors="none", hatches=[CROSSES], zorder=2
+    )
+    area.set(edgecolor=STROKE, linewidth=0.0)
+    corner = (float(section.coordinates[0][0]), float(section.coordinates[1][0]))
+    style: dict[str, Any] = {"facecolor": "none", "edgecolor": STROKE, "hatch": CROSSES, "linewidth": 0.6}
+    ax.add_patch(Rectangle(corner, 0, 0, label="depends on the box", **style))
+    legend(ax)
+    return [area]
+
+
+def _pattern(ax: Axes) -> str:
+    """The first pattern that no set in the legend has."""
+    used = [handle.get_hatch() for handle in ax.get_legend_handles_labels()[0] if hasattr(handle, "get_hatch")]
+    return next((pattern for pattern in DOTS if pattern not in used), DOTS[0])
+
+
 def add_colorbar(ax: Axes, mesh: Any, label: str) -> Any:
     """Draw the colour bar of a mesh, with a horizontal label above it."""
     from matplotlib.ticker import FuncFormatter
@@ -249,7 +277,8 @@ def add_colorbar(ax: Axes, mesh: Any, label: str) -> Any:
     bar.outline.set_visible(False)
     bar.ax.tick_params(width=0.8, length=3, labelsize=9)
     # a text, because the layout reserves room for it but not for a title; the unit goes below the name, to save width
-    above = label.replace(" [", "\n[").replace(" = ", " =\n")
+    above = label.replace(" [", "\n[")
+    above = above.replace(" = ", " =\n") if max(map(len, above.split("\n"))) > WORDY else above
     bar.ax.text(0.0, 1.02, above, transform=bar.ax.transAxes, ha="left", va="bottom", fontsize=9, gid="label")
     return bar
 

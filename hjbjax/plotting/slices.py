@@ -27,10 +27,11 @@ if TYPE_CHECKING:
 
 # coordinates by axis number or name; three types, because a type checker does not accept {0: 1.0} for the last one
 Cuts: TypeAlias = Mapping[int, float] | Mapping[str, float] | Mapping[int | str, float]
-STOP, PUSH = "stop", "push"  # the labels of the stopping set and of the push region
+STOP, PUSH = "stop", "push"  # the labels of the stopping set and of a push region, which the direction follows
 CHUNK = 1 << 16  # number of states evaluated at once, to bound the memory of intermediate arrays
 RASTER = 301  # points per axis for the outline of a set; a disc a tenth of the plot wide has 30 across
 ON_NODE = 1e-9  # fraction of a cell: a coordinate this close to a node means the node, so 0.1 + 0.2 means 0.3
+ENDS = 0.01  # fraction of the range of V: where the ends of the box change V by more, pictures are marked
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
@@ -64,6 +65,7 @@ class Described(NamedTuple):
     discrete: bool = False  # the mean of two enumerated controls may not be admissible
     stopping: Array | None = None  # the nodes where it is optimal to stop
     pushing: Array | None = None  # the nodes where each push is optimal
+    box_error: Array | None = None  # the change of V under another assumption at the ends of the box
 
 
 def described(solution: "Solution | None") -> Described:
@@ -82,8 +84,9 @@ class Region(NamedTuple):
 
     @property
     def visible(self) -> bool:
-        """True if the set has an interior; a single point is not drawn."""
-        return bool(np.min(self.level) < 0)
+        """True if the set is as wide as a line; a point, or a face of the box, is not drawn."""
+        inside = self.level < 0
+        return bool(np.any(inside[:-2, :-2] & inside[2:, :-2] & inside[:-2, 2:] & inside[2:, 2:]))
 
 
 def region_of(function: Callable[[State], Number], section: Section, label: str) -> Region:
@@ -124,7 +127,9 @@ def target_of(solution: "Solution", time: float | None = None) -> Callable[[Stat
 def decided_sets(
     solution: "Solution", section: Section, time: float | None = None
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """The stopping set and the push region in the plane of a section, bool, and V there, by name; none for tubes.
+    """The stopping set and the region of each push in the plane of a section, bool, and V there; none for tubes.
+
+    Their names are the keys. The name of a push has its direction, as in "push cash down".
 
     A tube without running cost and noise is drawn by its level sets, and its paths do not stop.
     """
@@ -132,18 +137,43 @@ def decided_sets(
     if known.problem is not None and is_tube(known.problem):
         return {}
     cuts: Cuts = section.cuts
-    pushed = None if known.pushing is None else np.any(known.pushing, axis=-1)
     found = {}
-    for name, mask in ((STOP, known.stopping), (PUSH, pushed)):
-        if mask is not None:
-            inside, value = (
-                section_of(
-                    "value", at_time(solution, np.asarray(f, float), time)[0], section.grid, cuts, "", nearest=True
-                )
-                for f in (mask, solution.value)
-            )
-            found[name] = inside.values.data > 0.5, value.values.data
+    for name, mask in _masks(known, section.grid).items():
+        inside, value = (
+            section_of("value", at_time(solution, np.asarray(f, float), time)[0], section.grid, cuts, "", nearest=True)
+            for f in (mask, solution.value)
+        )
+        found[name] = inside.values.data > 0.5, value.values.data
     return found
+
+
+def _masks(known: Described, grid: Grid) -> dict[str, np.ndarray]:
+    """The nodes where the state stops or is pushed, by name."""
+    found = {} if known.stopping is None else {STOP: np.asarray(known.stopping)}
+    if known.pushing is None:
+        return found
+    pushes = getattr(known.problem, "pushes", ())
+    if not pushes:  # a solution from a file does not know its problem
+        return found | {PUSH: np.any(known.pushing, axis=-1)}
+    for number, push in enumerate(pushes):
+        axis, sign = push.step
+        name = f"{PUSH} {grid.names[axis]} {'up' if sign > 0 else 'down'}"
+        mask = np.asarray(known.pushing)[..., number]
+        found[name] = found[name] | mask if name in found else mask
+    return found
+
+
+def near_ends(solution: "Solution", section: Section, time: float | None = None) -> np.ndarray:
+    """The nodes of a section where V depends on the assumptions at the ends of the box, bool."""
+    error = described(solution).box_error
+    if error is None:
+        return np.zeros(section.values.shape, bool)
+    value = at_time(solution, solution.value, time)[0]
+    known = value[np.isfinite(value)]
+    # a march has one estimate for each time, or one for the earliest time
+    change = at_time(solution, error, time)[0] if np.ndim(error) > solution.grid.ndim else np.asarray(error)
+    cut = section_of("value", change, section.grid, section.cuts, "").values.filled(0.0)
+    return cut > ENDS * (np.ptp(known) if known.size else np.inf)
 
 
 def sets_of(solution: "Solution", time: float | None = None) -> dict[str, Callable[[State], Number]]:

@@ -36,7 +36,9 @@ COLOURS = (
     "#000000",
 )  # Okabe and Ito: distinguishable with colour blindness
 NARROW, WIDE, SOLID = (5.4, 4.2), (5.4, 3.2), (5.4, 4.8)  # inches, for planes, for lines over time, for surfaces
+LINE, HANDLE = 62, 6  # characters of a line of a legend, and those that a mark and its margins take
 DPI = 200  # default resolution of saved pictures
+STROKES = ("-", "--", "-.", ":")  # the colours of two lines may be one grey in print
 # for an argument name, or function.argument: the attributes that the argument must have, and a description of it
 DRAWN: dict[str, tuple[tuple[str, ...], str]] = {
     "solution": (("grid", "value"), "the Solution of solve or march"),
@@ -183,13 +185,13 @@ def logarithmic(ax: Axes, places: np.ndarray | None = None) -> None:
 
 
 def few(lo: float, hi: float) -> list[float]:
-    """Two to seven round numbers between the ends of a logarithmic scale, or the ends if there are fewer than two."""
+    """Three to seven round numbers between the ends of a logarithmic scale, or the ends and their middle."""
     powers = 10.0 ** np.arange(np.floor(np.log10(lo)), np.ceil(np.log10(hi)) + 1)
-    for digits in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)):
+    for digits in ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0), range(1, 10)):
         found = [tick for tick in np.outer(powers, digits).ravel().tolist() if lo <= tick <= hi]
-        if len(found) >= 2:
+        if len(found) >= 3:
             return found[:: -(-len(found) // 7)]  # rounded up, so that at most seven remain
-    return [lo, hi]
+    return [lo, float(np.sqrt(lo * hi)), hi]
 
 
 def styled(ax: Axes) -> Axes:
@@ -200,6 +202,11 @@ def styled(ax: Axes) -> Axes:
     ax.xaxis.label.set_fontsize(10)
     ax.yaxis.label.set_fontsize(10)
     return ax
+
+
+def line_look(number: int) -> dict[str, Any]:
+    """The colour and the stroke of one of several lines; neighbouring lines differ in both."""
+    return {"color": COLOURS[number % len(COLOURS)], "linestyle": STROKES[number % len(STROKES)]}
 
 
 def label_axes(ax: Axes, x: str, y: str) -> None:
@@ -217,4 +224,15 @@ def legend(ax: Axes) -> Legend:
     """
     height = 1.07 if ax.get_title(loc="right") else 1.0
     style: dict[str, Any] = {"fontsize": 8, "edgecolor": "none", "handlelength": 1.6, "columnspacing": 1.2}
-    return ax.legend(loc="lower left", bbox_to_anchor=(0.0, height), ncols=4, frameon=False, borderaxespad=0.2, **style)
+    style |= {"ncols": _columns(ax.get_legend_handles_labels()[1])}
+    return ax.legend(loc="lower left", bbox_to_anchor=(0.0, height), frameon=False, borderaxespad=0.2, **style)
+
+
+def _columns(labels: Sequence[str]) -> int:
+    """The largest number of columns, at most four, that fits into a line of a legend."""
+    for columns in (4, 3, 2):
+        # matplotlib fills one column after the other, and the first ones may have one more
+        parts = np.array_split([len(label) + HANDLE for label in labels], min(columns, max(len(labels), 1)))
+        if sum(int(part.max(initial=0)) for part in parts) <= LINE:
+            return columns
+    return 1

@@ -137,7 +137,8 @@ _ENTRIES = (
         "dubins",
         "drive a car that cannot turn on the spot to a disc",
         dubins,
-        start=(-1.5, 0.5, 0.0),
+        # too close to turn towards the disc at once: the car turns away from it first
+        start=(0.0, 1.2, 0.0),
         duration=8.0,
         kinked=True,
     ),
@@ -250,9 +251,9 @@ _ENTRIES = (
         "pursuit",
         "catch a swimmer with a boat whose rudder breaks at random",
         pursuit,
-        # behind the swimmer, on a course away from him
-        start=(1.0, 2.5),
-        duration=6.0,
+        # the boat has turned towards the swimmer shortly before its rudder breaks, in the run that is drawn
+        start=(2.0, 1.2),
+        duration=4.0,
         mode="steers",
     ),
     Entry(

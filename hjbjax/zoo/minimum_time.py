@@ -117,7 +117,7 @@ def double_integrator(
         exit_cost=exact,
         control_names=("force",),
         control_units=("N",),
-        value_name=f"V = {TIME}",
+        value_name=f"V = {TIME} [s]",
     )
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("position", "velocity"), units=("m", "m/s"))
 
@@ -162,7 +162,7 @@ def zermelo(
         target=Disc(radius, 2).level,
         exit_cost=exact,
         control_names=("course east", "course north"),
-        value_name=f"V = {TIME}",
+        value_name=f"V = {TIME} [s]",
         time_unit="s",
     )
     return problem, Grid([-2.0, -2.0], [2.0, 2.0], shape, names=("east", "north"), units=("m", "m"))

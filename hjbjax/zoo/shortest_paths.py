@@ -100,7 +100,7 @@ def eikonal(
         # Euclidean for every norm, because it only selects the nodes with the prescribed exact value
         target=Disc(radius, dim).level,
         exit_cost=exact,
-        value_name=f"V = {TIME}",
+        value_name=f"V = {TIME} [s]",
         time_unit="s",
     )
     # an odd number puts a node at the origin, which is the whole target for radius 0
@@ -177,7 +177,7 @@ def dubins(
         target=Disc(radius, 2).level,  # with any heading; the default exit cost is zero
         control_names=("turning rate",),
         control_units=("rad/s",),
-        value_name=f"V = {TIME}",
+        value_name=f"V = {TIME} [s]",
     )
     # the heading is periodic, so its 40 nodes include −π but not π
     lo, hi = [-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi]

@@ -11,10 +11,11 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import front_door, pytree_dataclass
+from hjbjax.problem.pytree import front_door, is_traced, pytree_dataclass
 from hjbjax.problem.sets import Box
 from hjbjax.problem.types import Control, Number, State
 from hjbjax.zoo.ingredients import (
+    TIME,
     Exact,
     OutsideBall,
     OutsideCube,
@@ -128,7 +129,11 @@ def brownian_exit(
     """
     # check first, otherwise a half width ≤ 0 would be reported as a wrong corner of the grid
     check_positive("brownian_exit", noise=noise, half_width=half_width)
-    problem = Problem(no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level)
+    exact_time = not is_traced(discount) and discount == 0
+    problem = Problem(
+        no_drift, unit_cost, noise=noise, discount=discount, target=OutsideCube(half_width).level,
+        value_name=f"V = E[{'T' if exact_time else TIME}] [s]", time_unit="s",
+    )  # fmt: skip
     # odd numbers put a node at the centre
     shape = ((101,) if dim == 1 else (41,) * dim) if shape is None else shape
     return problem, Grid([-half_width] * dim, [half_width] * dim, shape, units=("m",) * dim)

@@ -62,9 +62,9 @@ def thermostat(
     Args:
       leak: κ, the rate at which the room cools down.
       outside: the temperature outside.
-      heating: the power of the heater, degrees per unit time.
+      heating: the power of the heater, degrees per hour.
       wanted: the temperature to hold.
-      fuel: the cost of heating per unit time.
+      fuel: the cost of heating per hour.
       wear: the cost of switching, each way.
       noise: σ.
       discount: β.
@@ -78,7 +78,7 @@ def thermostat(
     check_positive("thermostat", leak=leak, heating=heating, wear=wear, discount=discount)
     system = Thermostat(leak, outside, heating, wanted, fuel)
     modes = Modes(("off", "on"), switching_cost=two_modes(wear, wear))
-    problem = Problem(system.drift, system.cost, noise=noise, discount=discount, modes=modes)
+    problem = Problem(system.drift, system.cost, noise=noise, discount=discount, modes=modes, time_unit="h")
     return problem, Grid([10.0], [30.0], shape, names=("temperature",), units=("°C",))
 
 

@@ -1,6 +1,7 @@
 """``hjbjax gallery``: refusals before anything is solved, a whole page after an interrupt, and what a card says."""
 
 import base64
+import io
 import os
 import re
 import types
@@ -8,11 +9,15 @@ import types
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
 
 import hjbjax
+from docs.pictures import write_pictures
 from hjbjax import zoo
 from hjbjax.cli import gallery, run_folder
-from hjbjax.cli.gallery import Card, card, page, small_shape
+from hjbjax.cli.gallery import Card, card, drawn_shape, page
 from hjbjax.cli.main import main
 from hjbjax.solution.solution import Solution, Status
 
@@ -125,13 +130,50 @@ def test_an_interrupt_leaves_a_whole_page_of_what_was_done(cards, folder):
     assert os.listdir(folder) == ["page"]  # the hidden folder is gone
 
 
-def test_small_shapes_keep_proportions_and_parity():
+def test_shapes_for_pictures_keep_proportions_and_parity():
     for entry in zoo.catalogue.values():
         _, grid = entry.build()
-        shape = small_shape(grid.shape)
-        assert np.prod(shape) <= 1.1 * gallery.NODES
-        assert all((small - count) % 2 == 0 and small <= count for small, count in zip(shape, grid.shape, strict=True))
+        shape = drawn_shape(grid.shape)
+        assert np.prod(shape) <= 1.1 * gallery.NODES.get(len(shape), gallery.MOST)
+        assert all((drawn - count) % 2 == 0 for drawn, count in zip(shape, grid.shape, strict=True))
+        shares = np.divide(shape, grid.shape)
+        assert np.ptp(shares) * min(grid.shape) <= 2  # a node more or less, for the parity
         assert entry.build(shape=shape)[1].shape == shape
+        if len(shape) == 2:
+            assert np.prod(shape) >= 0.9 * gallery.NODES[2]  # cells of a few pixels
+
+
+def test_a_picture_is_compressed_without_loss():
+    """A smooth shade has the colours that matplotlib draws; lossy compression leaves stripes."""
+    figure = Figure(figsize=(2.0, 1.5), dpi=gallery.DPI)
+    figure.add_subplot().pcolormesh(np.linspace(0, 1, 40)[:, None] * np.ones(30), shading="gouraud", cmap="cividis")
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    shown = np.asarray(Image.open(io.BytesIO(gallery.webp(figure))).convert("RGB"))
+    np.testing.assert_array_equal(shown, np.asarray(canvas.buffer_rgba())[..., :3])
+
+
+def test_a_constant_feedback_is_a_number_and_not_a_picture(monkeypatch):
+    grid = hjbjax.Grid([0.0], [1.0], (101,))
+    x = grid.nodes()
+    wiggle = 0.5 + 1e-4 * np.sin(7 * x)
+    solution = Solution(grid, x[:, 0], np.concatenate([wiggle, x], axis=-1))
+    assert run_folder.constant_input(solution, 0, {}) == pytest.approx(0.5, abs=1e-4)
+    assert run_folder.constant_input(solution, 1, {}) is None
+    figure = run_folder.plot_policies(hjbjax.Problem(lambda x, u: u, lambda x, u: 1.0), solution, {}, False)
+    assert [ax.get_ylabel() for ax in figure.axes] == ["u2"]
+    level = Solution(grid, x[:, 0], wiggle)
+    figure = run_folder.plot_policies(hjbjax.Problem(lambda x, u: u, lambda x, u: 1.0), level, {}, False)
+    assert [ax.get_ylabel() for ax in figure.axes] == ["u"]  # `hjbjax solve` always draws a feedback
+
+
+def test_new_pictures_replace_all_old_ones(tmp_path):
+    for number in (1, 2):
+        (tmp_path / f"smooth-{number}.webp").write_bytes(b"old")
+    (tmp_path / "smooth-game-1.webp").write_bytes(b"other")
+    write_pictures(made("smooth"), tmp_path)
+    assert sorted(os.listdir(tmp_path)) == ["smooth-1.webp", "smooth-game-1.webp"]
+    assert (tmp_path / "smooth-1.webp").read_bytes() == PICTURE
 
 
 def solved(value, code=Status.CONVERGED):

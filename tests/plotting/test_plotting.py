@@ -11,15 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from pictures import hatched_nodes, scale_label
 from pictures import pictures as plotting
 
 from hjbjax import plotting as on_current_axes
 from hjbjax import zoo
+from hjbjax.plotting.scales import set_ticks
+from hjbjax.plotting.style import legend
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import Labels
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pushes import Push
 from hjbjax.problem.sets import Ball, Box
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solution.placement import FileError
@@ -175,7 +179,7 @@ def test_a_control_that_jumps_over_one_axis_is_drawn_as_steps():
 def test_value_and_time_have_the_names_of_the_problem():
     problem, grid = zoo.eikonal(shape=(11, 11))
     solution = made(grid, lambda x: x[..., 0], labels=problem.labels)
-    assert scale_label(plotting.value(solution)[0]) == "V = (1 − e⁻ᵝᵀ)/β"
+    assert scale_label(plotting.value(solution)[0]) == "V = (1 − e⁻ᵝᵀ)/β [s]"
     path = path_of([[0.5, 0.0], [0.0, 0.0]])
     assert [ax.get_xlabel() for ax in plotting.closed_loop(solution, path).figure.axes][-1] == "t [s]"
 
@@ -776,3 +780,162 @@ def test_a_tube_has_no_stopping_set_in_its_picture():
     problem = Problem(lambda x, u: u, controls=Box([-1.0], [1.0]), stopping_cost=lambda x: jnp.abs(x[0]))
     solution = made(grid, lambda x: x[..., 0] ** 2, stopping=np.ones(41, bool), problem=problem)
     assert labels(plotting.value(solution).ax) == []
+
+
+class InModes(SimpleNamespace):
+    """Solutions of two modes over one state, in place of one solution with modes."""
+
+    def in_mode(self, number):
+        return self.parts[number]
+
+
+def two_modes(pushed=True):
+    grid = Grid([0.0], [1.0], (11,), names=("cash",))
+    x = grid.nodes()[:, 0]
+    pushes = (Push([-1.0], reward=0.9), Push([1.0], cost=1.1))
+    problem = Problem(lambda x, u: u, lambda x, u: 1.0, Box([-1.0], [1.0]), discount=1.0, pushes=pushes)
+    masks = ([x > 0.7, x < -1.0], [x > 0.7, x < 0.2])
+    parts = [
+        Solution(
+            grid, x + i, x[:, None], **({"pushing": np.stack(mask, axis=-1), "problem": problem} if pushed else {})
+        )
+        for i, mask in enumerate(masks)
+    ]
+    whole = SimpleNamespace(modes=("rich", "poor"), ndim=2, shape=(2, 11), periodic=(False, False))
+    return InModes(grid=whole, value=np.zeros((2, 11)), parts=parts)
+
+
+def test_sets_of_two_modes_have_names_and_colours_of_their_own():
+    picture = plotting.value(two_modes())
+    handles, names = picture.ax.get_legend_handles_labels()
+    assert set(names) == {"rich", "poor", "push cash down, rich", "push cash down, poor", "push cash up, poor"}
+    look = dict(zip(names, handles, strict=True))
+    for mode in ("rich", "poor"):
+        colour = look[mode].get_color()
+        assert to_hex(look[f"push cash down, {mode}"].get_edgecolor()) == colour
+    assert look["rich"].get_color() != look["poor"].get_color()
+    assert look["rich"].get_linestyle() != look["poor"].get_linestyle()
+    assert len({look[name].get_hatch() for name in names if "push" in name}) == 3
+    band = look["push cash down, poor"]
+    assert (band.get_x(), band.get_x() + band.get_width()) == pytest.approx((0.75, 1.0), abs=0.051)
+    assert saved(picture)
+
+
+def test_a_push_from_a_file_has_no_direction():
+    grid = line().grid
+    pushing = grid.nodes() > 1
+    assert labels(plotting.value(Solution(grid, grid.nodes()[:, 0], -grid.nodes(), pushing=pushing)).ax) == ["push"]
+
+
+@pytest.mark.parametrize("ends", [(-0.92, 0.42), (0.0, 1.0), (-1.02, 0.02), (0.0451, 0.0449), (3.0, 61.0)])
+@pytest.mark.parametrize("inches", [0.7, 1.2, 4.0])
+def test_an_axis_has_three_ticks_or_more(ends, inches):
+    figure = Figure(figsize=(5, inches))
+    ax = figure.add_axes((0, 0, 1, 1))
+    ax.set_ylim(*sorted(ends))
+    set_ticks(ax.yaxis, False)
+    ticks = ax.yaxis.get_major_locator()()
+    assert np.count_nonzero((ticks >= min(ends)) & (ticks <= max(ends))) >= 3
+
+
+def test_a_target_as_thin_as_a_face_of_the_box_is_not_in_the_legend():
+    grid = Grid([0.0, 0.0], [1.0, 1.0], (11, 11))
+    solution = made(grid, lambda x: x[..., 0])
+    for width, shown in ((1e-4, False), (0.1, True)):
+        ax = plotting.value(solution, target=lambda x, width=width: x[1] - width).ax
+        assert (labels(ax) == ["target"]) == shown
+
+
+def test_where_the_ends_of_the_box_decide_the_value_is_crossed_out():
+    grid = Grid([-1.0, -1.0], [1.0, 1.0], (21, 21))
+    x = grid.nodes()[..., 0]
+    error = np.where(x > 0.65, 0.05, 0.001)  # of a range of 2
+    solution = made(grid, lambda x: x[..., 0], lambda x: -x[..., :1], box_error=error)
+    for draw in (plotting.value, plotting.policy):
+        picture = draw(solution)
+        assert labels(picture.ax) == ["depends on the box"]
+        np.testing.assert_array_equal(hatched_nodes(picture, grid), x > 0.65)
+    assert labels(plotting.value(made(grid, lambda x: x[..., 0], box_error=error / 100)).ax) == []
+
+
+def test_a_switching_curve_along_nodes_where_both_signs_are_equally_good():
+    """V = x₂² with the feedback −sign(x₂), which is arbitrary on x₂ = 0; on a circle it also switches at the seam."""
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (41, 1))
+    for periodic, top in ((False, 1.0), (True, np.pi)):
+        grid = Grid([-1.0, -top], [1.0, top], (41, 40 + (not periodic)), periodic=(False, periodic))
+
+        def feedback(x, top=top):
+            free = np.isclose(x[..., 1], 0) | np.isclose(x[..., 1], -top)
+            inside = np.where(free, signs, -np.sign(x[..., 1]))[..., None]
+            return np.where(x[..., 1:] < -top * 0.999, 1.0, inside) if top == 1.0 else inside
+
+        solution = made(grid, lambda x, top=top: 1 - np.cos(x[..., 1] * np.pi / top), feedback)
+        contour = plotting.switching_curve(solution, label=None)[0]
+        curves = [curve for curve in contour.get_paths()[0].to_polygons(closed_only=False) if len(curve) > 1]
+        heights = np.concatenate([curve[:, 1] for curve in curves])
+        inner = heights[np.abs(heights) < top / 2]
+        np.testing.assert_allclose(inner, 0, atol=1e-6)
+        seam = heights[np.abs(heights) >= top / 2]
+        assert bool(seam.size) == periodic
+        np.testing.assert_allclose(np.abs(seam), top, atol=1e-6)
+
+
+def test_states_of_different_units_have_axes_of_their_own_and_so_has_the_mode():
+    grid = Grid([0.0] * 3, [1.0] * 3, (5, 5, 5), names=("x", "y", "angle"), units=("m", "m", "rad"))
+    solution = made(grid, lambda x: x[..., 0], lambda x: x[..., :2])
+    path = path_of(np.linspace([0.0, 0.1, 0.2], [1.0, 0.9, 0.5], 7), np.zeros((6, 2)))
+    picture = plotting.closed_loop(solution, path)
+    plane, *panels = [ax for ax in picture.figure.axes if ax.get_label() != "<colorbar>"]
+    assert labels(plane) == ["path", "start", "end"]
+    assert [ax.get_ylabel() for ax in panels] == ["state", "angle\n[rad]", "control"]
+    assert [labels(ax) for ax in panels] == [["x [m]", "y [m]"], [], ["u1", "u2"]]
+    assert [ax.get_xlabel() for ax in panels] == ["", "", "t"]
+    strokes = [drawn.get_linestyle() for drawn in panels[0].get_lines()]
+    assert strokes == ["-", "--"]
+    assert saved(picture)
+
+
+def test_the_mode_of_a_path_is_drawn_under_its_states():
+    solution = two_modes(pushed=False)
+    path = path_of([[0.1], [0.5], [0.9]], np.zeros((2, 1)))
+    path.modes = np.array([1, 1, 0])
+    picture = plotting.closed_loop(solution, path)
+    *_, lowest = picture.figure.axes
+    assert lowest.get_ylabel() == "mode"
+    assert [tick.get_text() for tick in lowest.get_yticklabels()] == ["rich", "poor"]
+    assert lowest.get_lines()[0].get_ydata().tolist() == [1, 1, 0]
+
+
+def test_a_legend_of_long_names_stays_in_the_figure():
+    figure = Figure(figsize=(5.4, 4.2), layout="constrained")
+    ax = figure.add_subplot()
+    for name in ("operating", "push cash down, operating", "issuing", "push cash up, issuing"):
+        ax.plot([0, 1], [0, 1], label=name)
+    box = legend(ax)
+    figure.canvas.draw()
+    assert box.get_window_extent().x1 <= figure.bbox.x1
+
+
+def test_the_edge_of_a_bang_bang_feedback_is_no_staircase():
+    """The feedback is −1 inside a circle of radius 1.23, on cells of 0.1; the edge is within half a cell of it."""
+    grid = Grid([-2.0, -2.0], [2.0, 2.0], (41, 41))
+    solution = made(grid, lambda x: x[..., 0], lambda x: np.where((x**2).sum(-1) < 1.23**2, -1.0, 1.0)[..., None])
+    mesh, edge = plotting.policy(solution)
+    inner, outer = (path.to_polygons() for path in edge.get_paths())
+    assert len(inner) == len(outer) == 2  # rings around the circle
+    radius = np.linalg.norm(np.concatenate(inner), axis=-1)
+    near = radius[np.abs(radius - 1.23) < 0.1]
+    assert near.size > 40
+    assert np.abs(near - 1.23).max() < 0.05
+    assert [tuple(colour) for colour in edge.get_facecolor()] == [mesh.cmap(0.0), mesh.cmap(1.0)]
+    off = made(grid, lambda x: x[..., 0], lambda x: np.sign(np.round(x[..., :1] * 0.9)))  # zero in between
+    assert len(plotting.policy(off)) == 1
+
+
+def test_a_short_axis_of_an_angle_has_few_ticks():
+    for inches, count in ((0.9, 3), (4.0, 7)):
+        ax = Figure(figsize=(5, inches)).add_axes((0, 0, 1, 1))
+        ax.set_ylim(0.5 * np.pi, 2 * np.pi)
+        set_ticks(ax.yaxis, True)
+        ticks = ax.yaxis.get_major_locator()()
+        assert np.count_nonzero((ticks > 0.49 * np.pi) & (ticks < 2.01 * np.pi)) <= count

@@ -1,6 +1,10 @@
-"""The public names, imported together when the first of them is used; see ``hjbjax.__getattr__``."""
+"""The public names, imported together when the first of them is used; see ``hjbjax.__getattr__``.
 
-from typing import TYPE_CHECKING
+The names in ``LATER`` are imported one by one, because few programs use them.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from hjbjax import geometry
 from hjbjax._version import __version__
@@ -12,15 +16,7 @@ from hjbjax.applications.perturbations import perturbation_study
 from hjbjax.applications.probabilities import expected_exit_time, reach_probability, stay_probability
 from hjbjax.applications.reachability import avoid, from_hj_reachability, reach, reach_avoid
 from hjbjax.applications.transitions import Transition, transition
-from hjbjax.calibration.design import design
-from hjbjax.calibration.optimisation import Fit, fit
-from hjbjax.calibration.trajectories import fit_trajectories
-from hjbjax.decomposition.combination import BlockSolution
-from hjbjax.decomposition.decompose import Decomposition, decompose
 from hjbjax.discretisation.schemes import Eno2, Limited, Upwind, Weno5
-from hjbjax.enclosure.bounds import Enclosure
-from hjbjax.enclosure.enclose import enclose
-from hjbjax.enclosure.tubes import TubeEnclosure, enclose_tube
 from hjbjax.extremals.indirect_method import FreeTime, pontryagin
 from hjbjax.feedback.dissipation import dissipation
 from hjbjax.feedback.feedback import greedy_feedback
@@ -31,8 +27,6 @@ from hjbjax.geometry.lyapunov import lyapunov_check
 from hjbjax.iteration.evaluation import Direct, Krylov, Sweeps
 from hjbjax.iteration.methods import Nested, PolicyIteration, ValueIteration
 from hjbjax.iteration.time_methods import Explicit, Implicit, Tableau
-from hjbjax.linear_games import convex
-from hjbjax.linear_games.hopf import HopfSolution, hopf
 from hjbjax.markov_chain import chain
 from hjbjax.problem.ends import Dirichlet, Neumann, Robin
 from hjbjax.problem.grid import Grid
@@ -57,6 +51,32 @@ from hjbjax.tracing.interpreter import FallbackWarning
 
 if TYPE_CHECKING:
     from hjbjax import filtering, neural, plotting, zoo
+    from hjbjax.calibration.design import design
+    from hjbjax.calibration.optimisation import Fit, fit
+    from hjbjax.calibration.trajectories import fit_trajectories
+    from hjbjax.decomposition.combination import BlockSolution
+    from hjbjax.decomposition.decompose import Decomposition, decompose
+    from hjbjax.enclosure.bounds import Enclosure
+    from hjbjax.enclosure.enclose import enclose
+    from hjbjax.enclosure.tubes import TubeEnclosure, enclose_tube
+    from hjbjax.linear_games import convex
+    from hjbjax.linear_games.hopf import HopfSolution, hopf
+
+LATER = {  # the modules of the names that are imported on first use
+    "BlockSolution": "decomposition.combination",
+    "Decomposition": "decomposition.decompose",
+    "Enclosure": "enclosure.bounds",
+    "Fit": "calibration.optimisation",
+    "HopfSolution": "linear_games.hopf",
+    "TubeEnclosure": "enclosure.tubes",
+    "decompose": "decomposition.decompose",
+    "design": "calibration.design",
+    "enclose": "enclosure.enclose",
+    "enclose_tube": "enclosure.tubes",
+    "fit": "calibration.optimisation",
+    "fit_trajectories": "calibration.trajectories",
+    "hopf": "linear_games.hopf",
+}
 
 __all__ = [
     "Ball",
@@ -147,3 +167,12 @@ __all__ = [
     "transition",
     "zoo",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """A name that is imported on first use."""
+    if name == "convex":
+        return importlib.import_module("hjbjax.linear_games.convex")
+    if name not in LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"hjbjax.{LATER[name]}"), name)

@@ -3,12 +3,14 @@
 The optimiser works on z = θ/scale, where the scale of a parameter is the size of its initial value, the width of its
 bounds if that is zero, or 1. Its step lengths are therefore relative, and other units do not change its path. After
 every step the parameters are moved to the nearest point within their bounds.
+
+A checkpoint identifies the loss and the optimiser by the operations of a whole step.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +21,13 @@ from hjbjax.problem import arguments
 from hjbjax.problem.pytree import INTERRUPT, front_door, is_traced
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution import files
+from hjbjax.solution.checkpoints import KINDS, Checkpoint, check_alike, open_checkpoint
 from hjbjax.solution.clock import CUT, Clock, noting_interrupts
+from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.host_loop import progress_bar
+from hjbjax.tracing.closures import digest_of_program
 
 RATE = 0.05  # learning rate of the default optimiser, relative to the size of each parameter
 EARLY = 1e-3  # fraction of the tolerance at which a run ends before its last step
@@ -122,6 +127,8 @@ def fit(
     seed: int = 0,
     check_gradient: bool = False,
     tol: float = 1e-6,
+    checkpoint: Path | Checkpoint | None = None,
+    resume: bool = False,
     time_limit: float | None = None,
     progress: bool | None = None,
 ) -> Fit:
@@ -142,6 +149,9 @@ def fit(
       check_gradient: compare the gradient at the initial parameters with a finite difference, and warn if they differ.
       tol: a run has converged if the loss changed by less than this fraction over the last tenth of the steps, and at
         least ten. The fraction is of the decrease since the first tenth. It ends early below a thousandth of it.
+      checkpoint: a file for the state of the fit, written every minute and at the end, or ``Checkpoint(path, every=)``.
+      resume: continue from that file if it exists, with the same bits. The loss and all arguments except
+        ``check_gradient``, ``time_limit`` and ``progress`` must be the same.
       time_limit: seconds, including compilation.
       progress: show a bar of the steps after a second; ``None``: on a terminal.
 
@@ -151,6 +161,9 @@ def fit(
     Raises:
       ValueError: the loss is not finite at the initial parameters, or an argument is not admissible.
       TypeError: the loss cannot be called, or a parameter is not a number.
+      FileExistsError: the checkpoint exists, without ``resume``.
+      FileError: the checkpoint belongs to another loss or other arguments, is in use by another run, or cannot be
+        written.
       SolveError: Ctrl-C or the time limit before the first step was complete.
 
     Example:
@@ -169,16 +182,16 @@ def fit(
     clock = Clock(seconds=time_limit, progress=progress)
     with noting_interrupts(clock), own_settings(x64=True):
         task = _task(loss, parameters, optimiser, bounds, count)
-        draw = np.random.default_rng(seed)
-        error = _gradient_error(task, draw) if check_gradient else None
-        runs: list[_Run] = []
-        with progress_bar(progress, {"total": count * (1 + restarts), "desc": "fit"}) as bar:
-            for start in [task.start, *(_random_start(task, draw) for _ in range(restarts))]:
-                runs.append(_run(task, start, count, tol, clock, bar))
-                if runs[-1].status in CUT:
-                    break
+        limits = {"steps": count, "restarts": int(restarts), "seed": seed, "tol": float(tol)}
+        asked = {} if checkpoint is None else _question(task) | limits
+        with open_checkpoint(checkpoint, (), 0, resume=resume, caller="fit", **asked) as file:
+            clock.journal = file and file.journal()
+            error = _gradient_error(task, np.random.default_rng(seed)) if check_gradient else None
+            draw = np.random.default_rng(seed)
+            starts = [task.start, *(_random_start(task, draw) for _ in range(restarts))]
+            runs = _runs(task, starts, count, tol, clock)
         best = min(runs, key=lambda run: run.loss)
-        if best.z is None:
+        if not best.history:
             if best.status in CUT:
                 raise SolveError(f"fit: {best.status}, before the first step was complete")
             raise ValueError(
@@ -195,26 +208,85 @@ def fit(
 
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """A fit in scaled parameters: ``step`` returns loss, finite flag, new parameters and new state of the optimiser."""
+    """A fit in scaled parameters.
+
+    ``step(z, state, scale, lower, upper)`` returns loss, finite flag, new parameters and new state of the optimiser.
+    """
 
     start: np.ndarray
+    scale: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    structure: Any
     begin: Callable
     step: Callable
     loss: Callable
     value_and_grad: Callable
     parameters: Callable
 
+    @property
+    def numbers(self) -> tuple[np.ndarray, ...]:
+        """The last arguments of a step."""
+        return self.scale, self.lower, self.upper
+
 
 @dataclasses.dataclass
 class _Run:
-    """One run: the best parameters, their loss, and the losses of all steps."""
+    """One run, which is also a part of a checkpoint.
 
-    status: Status
-    z: np.ndarray | None = None
+    Args:
+      current: the scaled parameters before the next step, and the state of the optimiser.
+      steps: the largest number of steps.
+      tol: the fraction of the decrease below which the loss no longer changes.
+      z: the best scaled parameters.
+      loss: their loss.
+      history: the losses of all steps.
+      status: the reason for the end.
+    """
+
+    current: tuple[Any, Any]  # replaced as a whole, so that Ctrl-C cannot separate them
+    steps: int
+    tol: float
+    z: np.ndarray
     loss: float = math.inf
     history: list[float] = dataclasses.field(default_factory=list)
+    status: Status = Status.MAX_STEPS
+    passing: ClassVar[bool] = False
+
+    def saved(self) -> list[Any]:
+        """The state before the next step."""
+        history = np.full(self.steps, np.nan)
+        history[: len(self.history)] = self.history
+        return [np.asarray(self.loss), history, self.z, *map(np.asarray, jax.tree.leaves(self.current))]
+
+    def restore(self, arrays: list[np.ndarray]) -> None:
+        """Continue from the arrays of ``saved``.
+
+        Raises:
+          ValueError: the arrays are not a state of this run.
+        """
+        check_alike(arrays, self.saved())
+        self.loss, self.z = float(arrays[0]), arrays[2]
+        self.history = arrays[1][np.isfinite(arrays[1])].tolist()
+        self.current = jax.tree.unflatten(jax.tree.structure(self.current), map(jnp.asarray, arrays[3:]))
+
+    def record(self, value: float) -> None:
+        """Record the loss of the current parameters."""
+        self.history.append(value)
+        if value < self.loss:
+            self.z, self.loss = np.asarray(self.current[0]), value
+
+    def has_settled(self, fraction: float = 1.0) -> bool:
+        """True if the loss changed by less than this fraction of the tolerance over the last tenth of the steps.
+
+        It compares the range of the last losses, because an optimiser with momentum may overshoot for some steps, with
+        the largest of the first losses, because a start at the optimum is the least of all losses.
+        """
+        patience = max(PATIENCE, self.steps // 10)
+        if len(self.history) <= patience:
+            return False
+        moved, whole = float(np.ptp(self.history[-patience:])), max(self.history[:patience]) - self.loss
+        return moved <= fraction * self.tol * whole
 
 
 def _task(loss: Callable, parameters: Any, optimiser: Any, bounds: tuple[Any, Any] | None, steps: int) -> _Task:
@@ -237,9 +309,8 @@ def _task(loss: Callable, parameters: Any, optimiser: Any, bounds: tuple[Any, An
     elif not (hasattr(optimiser, "init") and hasattr(optimiser, "update")):
         raise TypeError(f"fit: got optimiser = {optimiser!r:.100}, wanted one of optax, such as optax.adam(0.02)")
     optimiser = optax.with_extra_args_support(optimiser)
-    low, high = lower / scale, upper / scale
 
-    def of_scaled(z: Any) -> jax.Array:
+    def of_scaled(z: Any, scale: Any) -> jax.Array:
         value = jnp.asarray(loss(unravel(z * scale)))
         if value.shape != ():
             raise ValueError(f"fit: the loss returned shape {value.shape}, wanted one number")
@@ -248,16 +319,34 @@ def _task(loss: Callable, parameters: Any, optimiser: Any, bounds: tuple[Any, An
         return value.astype(jnp.float64)
 
     @jax.jit
-    def step(z: Any, state: Any) -> tuple[Any, ...]:
-        value, slope = jax.value_and_grad(of_scaled)(z)
-        updates, state = optimiser.update(slope, state, z, value=value, grad=slope, value_fn=of_scaled)
+    def step(z: Any, state: Any, scale: Any, low: Any, high: Any) -> tuple[Any, ...]:
+        value, slope = jax.value_and_grad(of_scaled)(z, scale)
+        options = {"value": value, "grad": slope, "value_fn": lambda z: of_scaled(z, scale)}
+        updates, state = optimiser.update(slope, state, z, **options)
         finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(slope))
         return value, finite, jnp.clip(optax.apply_updates(z, updates), low, high), state
 
     return _Task(
-        flat / scale, low, high, optimiser.init, step, jax.jit(of_scaled), jax.jit(jax.value_and_grad(of_scaled)),
-        lambda z: unravel(jnp.asarray(z * scale)),
+        flat / scale, scale, lower / scale, upper / scale, jax.tree.structure(initial), optimiser.init, step,
+        jax.jit(of_scaled), jax.jit(jax.value_and_grad(of_scaled)), lambda z: unravel(jnp.asarray(z * scale)),
     )  # fmt: skip
+
+
+def _question(task: _Task) -> dict[str, Any]:
+    """The task of a checkpoint by parts."""
+    z = jnp.asarray(task.start)
+    state = task.begin(z)
+    for leaf in jax.tree.leaves(state):
+        if (dtype := jnp.asarray(leaf).dtype) not in KINDS:
+            raise ValueError(
+                f"fit: the state of the optimiser has an array of dtype {dtype}, which a checkpoint cannot store; use\n"
+                "another optimiser, or leave out checkpoint="
+            )
+    return {
+        "loss or optimiser": digest_of_program(task.step, z, state, *task.numbers),
+        "parameters": np.concatenate([task.start, task.scale]), "structure of the parameters": task.structure,
+        "bounds": np.concatenate([task.lower, task.upper]),
+    }  # fmt: skip
 
 
 def _bounds(bounds: Any, initial: Any, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -295,43 +384,62 @@ def _random_start(task: _Task, draw: np.random.Generator) -> np.ndarray:
     return np.clip(np.where(finite, uniform, around), task.lower, task.upper)
 
 
-def _run(task: _Task, start: np.ndarray, steps: int, tol: float, clock: Clock, bar: Any) -> _Run:
-    """One run of the optimiser from a start."""
-    z, state = jnp.asarray(start), task.begin(jnp.asarray(start))
-    run, patience = _Run(Status.MAX_STEPS), max(PATIENCE, steps // 10)
-    for _ in range(steps):
+def _runs(task: _Task, starts: Sequence[np.ndarray], steps: int, tol: float, clock: Clock) -> list[_Run]:
+    """The runs of the optimiser from all starts, until one of them is cut short."""
+    runs: list[_Run] = []
+    with progress_bar(clock.progress, {"total": steps * len(starts), "desc": "fit"}) as bar:
+        for start in starts:
+            begun = jnp.asarray(start), task.begin(jnp.asarray(start))
+            runs.append(_Run(begun, steps, tol, np.full(start.shape, np.nan)))
+            _complete(runs[-1], task, clock, bar)
+            if runs[-1].status in CUT:
+                break
+    return runs
+
+
+def _complete(run: _Run, task: _Task, clock: Clock, bar: Any) -> None:
+    """Advance a run to its end, or bring it to its recorded state first."""
+    journal = clock.journal
+    recorded = None if journal is None else journal.enter(run)
+    if bar is not None:
+        bar.update(len(run.history))
+    if recorded is None:
+        run.status = _advance(run, task, clock, bar)
+        if journal is not None:
+            # all steps are done, although the loss may still decrease; the default rate has fallen to zero
+            journal.leave(run, Status.CONVERGED if run.status is Status.MAX_STEPS else run.status)
+    else:
+        run.status = recorded
+    if run.status in (Status.CONVERGED, Status.MAX_STEPS):
+        run.status = Status.CONVERGED if run.has_settled() else Status.MAX_STEPS
+
+
+def _advance(run: _Run, task: _Task, clock: Clock, bar: Any) -> Status:
+    """Advance a run step by step, and return the reason for its end."""
+    for _ in range(len(run.history), run.steps):
         if (over := clock.over()) is not None:
-            run.status = over
-            break
+            return over
         try:
-            value, finite, following, state = task.step(z, state)
+            value, finite, *following = task.step(*run.current, *task.numbers)
             value, finite = float(value), bool(finite)
         except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
             if not isinstance(error, KeyboardInterrupt) and not INTERRUPT.search(str(error)):
                 raise
-            run.status = Status.INTERRUPTED
-            break
+            return Status.INTERRUPTED
         if clock.interrupted:  # a solve in the loss was cut short, so this loss is not one
-            run.status = Status.INTERRUPTED
-            break
+            return Status.INTERRUPTED
         if not finite:
-            run.status = Status.NONFINITE
-            break
-        run.history.append(value)
-        if value < run.loss:
-            run.z, run.loss = np.asarray(z), value
+            return Status.NONFINITE
+        run.record(value)
         if bar is not None:
             bar.set_postfix_str(f"loss {run.loss:.3g}", refresh=False)
             bar.update(1)
-        if len(run.history) > patience:
-            # the range of the last losses, because an optimiser with momentum may overshoot for some steps
-            # and the largest of the first losses, because a start at the optimum is the least of all losses
-            moved, whole = float(np.ptp(run.history[-patience:])), max(run.history[:patience]) - run.loss
-            run.status = Status.CONVERGED if moved <= tol * whole else Status.MAX_STEPS
-            if moved <= EARLY * tol * whole:
-                break
-        z = following
-    return run
+        if run.has_settled(EARLY):
+            break
+        run.current = following[0], following[1]
+        if clock.journal is not None:
+            clock.journal.keep(run)
+    return Status.MAX_STEPS
 
 
 def _gradient_error(task: _Task, draw: np.random.Generator) -> float:
@@ -340,8 +448,8 @@ def _gradient_error(task: _Task, draw: np.random.Generator) -> float:
     reach = np.minimum(DIFFERENCE, (task.upper - task.lower) / 2)
     z = jnp.asarray(np.clip(task.start, task.lower + reach, task.upper - reach))
     direction = draw.choice([-1.0, 1.0], task.start.shape) * reach / DIFFERENCE
-    slope = float(task.value_and_grad(z)[1] @ direction)
-    above, below = (float(task.loss(z + sign * DIFFERENCE * direction)) for sign in (1, -1))
+    slope = float(task.value_and_grad(z, task.scale)[1] @ direction)
+    above, below = (float(task.loss(z + sign * DIFFERENCE * direction, task.scale)) for sign in (1, -1))
     difference = (above - below) / (2 * DIFFERENCE)
     error = abs(slope - difference) / max(abs(slope), abs(difference), np.finfo(float).tiny)
     if not error <= FAULTY:

@@ -304,7 +304,7 @@ def open_checkpoint(
 
     Args:
       checkpoint: the file, or a ``Checkpoint``.
-      problems: one problem, or the problems of all lanes.
+      problems: one problem, the problems of all lanes, or none.
       grid: the grid; without one the number of states.
       resume: continue from the file, if it exists.
       caller: the function that was called, for messages.
@@ -429,8 +429,10 @@ def _in_all_processes(path: str) -> Iterator[None]:
 def describe_question(problems: Sequence[Problem], grid: Grid | int, **others: Any) -> dict[str, str]:
     """The question of a run by parts, as text: digests of its problems, its grid, and its other arguments."""
     n = grid.ndim if isinstance(grid, Grid) else grid
-    digests = " ".join(closures.digest(problem, n) for problem in problems)
-    found = {"problem" if len(problems) == 1 else "list of problems": digests}
+    found = {}
+    if problems:
+        digests = " ".join(closures.digest(problem, n) for problem in problems)
+        found["problem" if len(problems) == 1 else "list of problems"] = digests
     if isinstance(grid, Grid):
         about = (
             grid.shape,

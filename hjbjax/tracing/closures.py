@@ -94,8 +94,7 @@ def digest(problem: Problem, n: int) -> str:
                 shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in _shapes(problem, name, n)]
                 _, closed = _trace(_bare(function), shapes)
                 if closed is not None:  # a function that cannot be traced is refused by the checks
-                    (numbers, *called), _ = fingerprint(closed.jaxpr, closed.consts)
-                    account.update(repr((numbers, *map(text_of_called, called))).encode())
+                    account.update(_text_of_program(closed).encode())
         sets = (problem.controls, problem.disturbances)
         # the structure of a set holds its kind, its dimension, and whether the sum of a simplex may be smaller
         kinds = [type(each) if callable(each) else jax.tree.structure(each) for each in sets]
@@ -103,6 +102,17 @@ def digest(problem: Problem, n: int) -> str:
         for leaf in jax.tree.leaves(problem):
             account.update(np.asarray(leaf, np.float64).tobytes())
     return account.hexdigest()
+
+
+def digest_of_program(function: Callable, *arguments: Any) -> str:
+    """A digest of the operations and constants of a function of arrays, the same in every process."""
+    closed = jax.make_jaxpr(function)(*arguments)
+    return hashlib.blake2b(_text_of_program(closed).encode(), digest_size=16).hexdigest()
+
+
+def _text_of_program(closed: jex.ClosedJaxpr) -> str:
+    (numbers, *called), _ = fingerprint(closed.jaxpr, closed.consts)
+    return repr((numbers, *map(text_of_called, called)))
 
 
 def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:

@@ -213,23 +213,27 @@ def check_against_joint_march(problem, grid, finer, horizon, x, **options):
     joint = hjb.march(problem, grid, horizon, policy=False, **options)
     error = hjb.Solution(grid, joint.grid_error[0], None).value_at(x)
     value = joint.value_at(0.0, x)
+    assert error.max() < 0.2  # V is between −0.6 and 1.5; an error as large as V would compare nothing
     for own in (grid, finer):
-        off = np.abs(parts.march(own, horizon).value_at(0.0, x) - value)
+        blocks = parts.march(own, horizon).value_at(0.0, x)
+        off = np.abs(blocks - value)
+        print(f"off {off.max():.2g}, mean {off.mean():.2g}; grid error {error.max():.2g}, mean {error.mean():.2g}")
         assert off.max() <= error.max()
         assert off.mean() <= error.mean()
-    return parts
+    return parts, blocks
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the grid is coarse")
 def test_two_double_integrators_equal_the_joint_march():
+    """A force of ±1 moves the end of a path by ±T²/2, so |x(1)| = max(|x + v| − ½, 0). The paths stay in the box."""
     distance = lambda x: jnp.maximum(jnp.abs(x[0]), jnp.abs(x[2])) - 0.5  # noqa: E731
     problem = hjb.reach(target=distance, tube=False, **INTEGRATORS)
-    grid, finer = (
-        hjb.Grid([-2.0, -1.5] * 2, [2.0, 1.5] * 2, shape * 2, edges="linear") for shape in ((21, 17), (81, 65))
-    )
+    grid, finer = (hjb.Grid([-2.0, -1.5] * 2, [2.0, 1.5] * 2, shape * 2) for shape in ((21, 17), (81, 65)))
     x = np.random.default_rng(1).uniform(-0.9, 0.9, (200, 4))
-    check_against_joint_march(problem, grid, finer, 1.0, x)
+    _, blocks = check_against_joint_march(problem, grid, finer, 1.0, x)
+    exact = np.max(np.maximum(np.abs(x[:, ::2] + x[:, 1::2]) - 0.5, 0), axis=1) - 0.5
+    print(f"from the exact value {np.abs(blocks - exact).max():.2g}")
+    assert np.abs(blocks - exact).max() < 0.06
 
 
 def three_states(x, u):
@@ -251,7 +255,7 @@ def test_a_reach_avoid_of_three_and_three_states_equals_the_joint_march():
         hjb.Grid([-2.0, -1.2, -1.0] * 2, [2.0, 1.2, 1.0] * 2, (nodes,) * 6, edges="linear") for nodes in (13, 49)
     )
     x = np.random.default_rng(2).uniform([-1, -0.6, -0.5] * 2, [1, 0.6, 0.5] * 2, (300, 6))
-    parts = check_against_joint_march(problem, grid, finer, 0.8, x, dtype="float32")
+    parts, _ = check_against_joint_march(problem, grid, finer, 0.8, x, dtype="float32")
     assert (parts.rule, parts.states) == ("first", ((0, 1, 2), (3, 4, 5)))
 
 

@@ -34,6 +34,7 @@ from hjbjax.problem.spaces import is_space
 from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import host_functions, jaxprs
+from hjbjax.tracing.descriptions import digest_of
 from hjbjax.tracing.outside import (
     FLOATS,
     NUMBERS,
@@ -44,7 +45,6 @@ from hjbjax.tracing.outside import (
     fingerprint,
     identity,
     numbers_read,
-    text_of_called,
     unnested,
 )
 
@@ -95,7 +95,7 @@ def digest(problem: Problem, n: int) -> str:
                 _, closed = _trace(_bare(function), shapes)
                 if closed is not None:  # a function that cannot be traced is refused by the checks
                     (numbers, *called), _ = fingerprint(closed.jaxpr, closed.consts)
-                    account.update(repr((numbers, *map(text_of_called, called))).encode())
+                    account.update(repr((numbers, *map(digest_of, called))).encode())
         sets = (problem.controls, problem.disturbances)
         # the structure of a set holds its kind, its dimension, and whether the sum of a simplex may be smaller
         kinds = [type(each) if callable(each) else jax.tree.structure(each) for each in sets]
@@ -362,7 +362,7 @@ def _trace_with_numbers_as_leaves(
         while read:
             asking = OfNumbers(function.func, tuple(read))
             found = _trace(Partial(asking, tuple(read.values()), *function.args, **function.keywords), arguments)
-            if found[1] is None:
+            if found[1] is None or jaxprs.calls_back(found[1].jaxpr):  # a host function cannot read a traced number
                 break
             first = len(jax.tree.leaves(function.keywords))
             stuck = decisive(found[1].jaxpr, found[1].jaxpr.invars[first : first + len(read)])

@@ -1,10 +1,14 @@
 """The command ``hjbjax``, also as ``python -m hjbjax``. This file does what must precede all other imports."""
 
 import os
+import sys
 
 
 def start() -> None:
     """Run the command and end the process with its exit code."""
+    if sys.flags.inspect and os.environ.pop("PYTHONINSPECT", "") and os.name == "posix":
+        # Python would end in a prompt, with exit code 1; it has read the variable, so it must start again
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     try:
         from hjbjax.cli import interrupts
 

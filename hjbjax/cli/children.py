@@ -407,8 +407,10 @@ def _main(module: str) -> None:
     lifeline, nothing = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.close(nothing)
-    # the launcher sends SIGTERM; SIGINT may have been sent by name to all processes, including the launcher
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # the launcher sends SIGTERM; other signals may have been sent by name to all processes, including the launcher, and
+    # if a launcher is killed, the system sends SIGHUP to a stopped process and continues it
+    for number in set(SIGNALS) - {signal.SIGTERM}:
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_follow, args=(lifeline,), daemon=True).start()
     runpy.run_module(module, run_name="__main__")
 

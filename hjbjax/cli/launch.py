@@ -171,6 +171,7 @@ def _join(this: Member) -> None:
             this.coordinator,
             this.processes,
             this.rank,
+            initialization_timeout=round(ARRIVAL) + this.processes,  # as in the launcher; JAX waits for five minutes
             heartbeat_timeout_seconds=this.heartbeat,
             coordinator_bind_address=this.coordinator,  # the default accepts connections from the whole network
         )

@@ -10,7 +10,6 @@ A run creates its file before it computes anything, which also tests the path, a
 
 import contextlib
 import dataclasses
-import hashlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,8 +28,7 @@ from hjbjax.solution.files import Expected, FileError
 from hjbjax.solution.locked_file import LockedFile
 from hjbjax.solution.placement import Path
 from hjbjax.solution.status import Status, warn
-from hjbjax.tracing import closures
-from hjbjax.tracing.outside import ADDRESS
+from hjbjax.tracing import closures, descriptions
 
 FORMAT, VERSION = "hjbjax.Checkpoint", 1
 SECONDS = 60.0  # seconds between two writes
@@ -438,14 +436,13 @@ def describe_question(problems: Sequence[Problem], grid: Grid | int, **others: A
             grid.shape,
             grid.periodic,
             grid.edges,
-            [each and (each.strength, each.center) for each in grid.stretch],
+            # as Python numbers, because NumPy prints an array with 8 digits
+            [each and (float(each.strength), float(each.center)) for each in grid.stretch],
         )
         ends = np.concatenate([np.asarray(grid.lo, np.float64), np.asarray(grid.hi, np.float64)])
         found["grid"] = f"{about} from {ends.tobytes().hex()}"
     for word, thing in others.items():
-        array = isinstance(thing, (np.ndarray, jax.Array))
-        said = hashlib.blake2b(np.asarray(thing).tobytes(), digest_size=16).hexdigest() if array else repr(thing)
-        found[word] = ADDRESS.sub("", said)
+        found[word] = repr(thing) if isinstance(thing, descriptions.PLAIN) else descriptions.digest_of(thing)
     return found
 
 

@@ -34,6 +34,7 @@ from hjbjax.problem.spaces import is_space
 from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import DType, Numbers
 from hjbjax.tracing import host_functions, jaxprs
+from hjbjax.tracing.descriptions import digest_of
 from hjbjax.tracing.outside import (
     FLOATS,
     NUMBERS,
@@ -44,7 +45,6 @@ from hjbjax.tracing.outside import (
     fingerprint,
     identity,
     numbers_read,
-    text_of_called,
     unnested,
 )
 
@@ -112,7 +112,7 @@ def digest_of_program(function: Callable, *arguments: Any) -> str:
 
 def _text_of_program(closed: jex.ClosedJaxpr) -> str:
     (numbers, *called), _ = fingerprint(closed.jaxpr, closed.consts)
-    return repr((numbers, *map(text_of_called, called)))
+    return repr((numbers, *map(digest_of, called)))
 
 
 def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:
@@ -372,7 +372,7 @@ def _trace_with_numbers_as_leaves(
         while read:
             asking = OfNumbers(function.func, tuple(read))
             found = _trace(Partial(asking, tuple(read.values()), *function.args, **function.keywords), arguments)
-            if found[1] is None:
+            if found[1] is None or jaxprs.calls_back(found[1].jaxpr):  # a host function cannot read a traced number
                 break
             first = len(jax.tree.leaves(function.keywords))
             stuck = decisive(found[1].jaxpr, found[1].jaxpr.invars[first : first + len(read)])

@@ -120,13 +120,13 @@ def names_read(code: types.CodeType) -> set[str]:
 def _is_library(thing: object) -> bool:
     """True if a global is a module, a function or a class of a library, which does not change between two solves."""
     if isinstance(thing, types.ModuleType):
-        return _is_of_library(thing.__name__)
+        return is_of_library(thing.__name__)
     home, name = getattr(thing, "__module__", None), getattr(thing, "__name__", None)
     # an object of a library's class, such as functools.partial, may hold anything; its module has no such name
-    return _is_of_library(home) and thing is getattr(sys.modules.get(home), str(name), None)
+    return is_of_library(home) and thing is getattr(sys.modules.get(home), str(name), None)
 
 
-def _is_of_library(module: object) -> TypeGuard[str]:
+def is_of_library(module: object) -> TypeGuard[str]:
     """True if a module belongs to one of ``LIBRARIES``."""
     return isinstance(module, str) and module.split(".")[0] in LIBRARIES
 
@@ -216,13 +216,30 @@ def _is_rule_of_jax(parameters: dict[str, Any]) -> bool:
 
 
 def _called(callback: object) -> Hashable:
-    """An identity of a host function: its code if it reads nothing else, otherwise the function."""
+    """An identity of a host function: its code if it reads only globals, otherwise the function."""
     function = getattr(callback, "callback_func", callback)
     if isinstance(function, types.FunctionType) and not (
         function.__closure__ or function.__defaults__ or function.__kwdefaults__
     ):
-        return function.__code__, id(function.__globals__)  # a lambda inside the drift is a new object in every trace
+        return ByCode(function)  # a lambda inside the drift is a new object in every trace
     return function
+
+
+class ByCode:
+    """A host function without a closure; it equals another with the same code and the same globals."""
+
+    def __init__(self, function: types.FunctionType):
+        self.function = function
+
+    def _key(self) -> tuple[types.CodeType, int]:
+        """The values that ``==`` and ``hash`` compare."""
+        return self.function.__code__, id(self.function.__globals__)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ByCode) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
 
 
 class Composite:
@@ -268,27 +285,6 @@ def unnested(function: Partial) -> Partial:
 def _is_partial(thing: object) -> TypeGuard[Partial]:
     """True for a ``Partial``: a function with some of its arguments."""
     return isinstance(thing, Partial)
-
-
-def text_of_called(called: Any) -> str:
-    """A description of a host function by its code and its data, the same in every process, for a fingerprint."""
-    function = called[0] if isinstance(called, tuple) else getattr(called, "__func__", called)
-    owner = getattr(called, "__self__", None)
-    held = [content(cell) for cell in getattr(function, "__closure__", None) or ()]
-    found = (
-        _text_of_code(code(function)),
-        held,
-        getattr(function, "__defaults__", None),
-        getattr(owner, "__dict__", None),
-    )
-    return ADDRESS.sub("", repr(found))
-
-
-def _text_of_code(found: object) -> str:
-    """The instructions of a function and of the functions defined in it, without line numbers and addresses."""
-    if not isinstance(found, types.CodeType):
-        return repr(found)
-    return repr((found.co_code, found.co_names, [_text_of_code(each) for each in found.co_consts]))
 
 
 class OfNumbers:

@@ -116,6 +116,15 @@ def test_the_command_with_all_streams_closed():
         assert done.returncode == code
 
 
+@posix
+def test_the_command_does_not_end_in_a_prompt():
+    """Its exit code would be 1 in any case."""
+    options = {"stdin": subprocess.DEVNULL, "env": {**ENVIRONMENT, "PYTHONINSPECT": "1"}}
+    words = [sys.executable, "-m", "hjbjax", "slove"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False, **options)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+
+
 @pytest.mark.parametrize("kind", BROKEN)
 def test_an_exit_code_holds_without_standard_error(quick, kind, monkeypatch, capsys):
     def warned(*arguments, **options):

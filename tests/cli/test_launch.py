@@ -256,6 +256,15 @@ def test_the_host_may_be_an_address_of_ipv6():
     assert launch._address_of("[::1]:4000")[1][:2] == ("::1", 4000)
 
 
+def test_a_process_waits_for_the_others_as_long_as_its_launcher(monkeypatch):
+    """JAX waits for five minutes, also with so many processes that the launcher waits for longer."""
+    options = {}
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **given: options.update(given))
+    launch._join(launch.Member(1, 200, "127.0.0.1:4000", HEARTBEAT))
+    assert options["initialization_timeout"] == launch.ARRIVAL + 200
+
+
 @pytest.mark.parametrize("number", ["0", "1"])
 def test_the_processes_part_before_the_pictures(number, tmp_path, monkeypatch):
     """JAX ends a process that waits for five minutes; and only the first one says that the steps ran out."""

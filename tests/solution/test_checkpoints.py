@@ -210,6 +210,25 @@ def test_the_file_of_another_question_is_refused(tmp_path, monkeypatch):
     hjb.solve(posed(), LINE, checkpoint=path, resume=True)
 
 
+class Own(hjb.Upwind):
+    """A scheme of a user, whose text does not show its number."""
+
+    def __init__(self, number):
+        super().__init__()
+        object.__setattr__(self, "number", number)
+
+
+def test_numbers_that_a_text_hides_belong_to_the_question():
+    def question(number, scheme):
+        grid = hjb.Grid([-1.0], [1.0], (21,), stretch=(hjb.Sinh(np.array(number)),))
+        return checkpoints.describe_question([posed()], grid, scheme=scheme, method=hjb.PolicyIteration())
+
+    first = question(2.0, Own(1.0))
+    assert first == question(2.0, Own(1.0))
+    assert [key for key in first if first[key] != question(2.0 + 1e-12, Own(1.0))[key]] == ["grid"]
+    assert [key for key in first if first[key] != question(2.0, Own(1.5))[key]] == ["scheme"]
+
+
 def test_what_stands_in_the_way_is_said_before_anything_is_computed(tmp_path):
     path = tmp_path / "run.npz"
     path.write_bytes(b"")

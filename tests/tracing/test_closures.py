@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import hjbjax as hjb
 from hjbjax.discretisation import posing
@@ -646,6 +647,96 @@ def test_a_digest_of_a_function_of_the_host_is_that_of_every_process():
         problem = hjb.Problem(OnHost(gain).drift, square, UNIT, discount=1.0)
         made.append(closures.digest(closures.settled(problem, 1), 1))
     assert made[0] != made[1] == made[2]
+
+
+class Gain:
+    """A callable object of the host."""
+
+    def __init__(self, gain):
+        self.gain = gain
+
+    def __call__(self, x):
+        return self.gain * np.asarray(x)
+
+
+def times_gain(gain):
+    """A host function that reads a number from a closure."""
+    return lambda x: gain * np.asarray(x)
+
+
+def interpolated(table):
+    """A host function that reads a long table, through a second function."""
+    places = np.linspace(-1.0, 1.0, len(table))
+    at = lambda x: np.interp(x, places, table)  # noqa: E731
+    return lambda x: at(np.asarray(x))
+
+
+def weighted(x, gain):
+    return gain * np.asarray(x)
+
+
+TABLE = np.linspace(0.0, 1.0, 5000)
+NEARLY = np.where(np.arange(5000) == 2500, TABLE + 1e-12, TABLE)
+SHARED = {"gain": 1.0}
+
+
+def read_through_a_global(x):
+    return SHARED["gain"] * np.asarray(x)
+
+
+HELD = {
+    "object": (lambda: Gain(1.0), lambda: Gain(2.0)),
+    "closure": (lambda: times_gain(1.0), lambda: times_gain(2.0)),
+    "table": (lambda: interpolated(TABLE), lambda: interpolated(NEARLY)),
+    "partial": (lambda: functools.partial(weighted, gain=1.0), lambda: functools.partial(weighted, gain=2.0)),
+    "nested": (lambda: times_gain({"a": [Gain(TABLE)]}), lambda: times_gain({"a": [Gain(NEARLY)]})),
+    "spline": (lambda: CubicSpline(TABLE, TABLE), lambda: CubicSpline(TABLE, NEARLY)),
+}
+
+
+def digest_with(host):
+    """The digest of a problem whose drift calls a host function."""
+
+    def drift(x, u):
+        return u + jax.pure_callback(host, jax.ShapeDtypeStruct(x.shape, x.dtype), x, vmap_method="expand_dims")
+
+    return closures.digest(closures.settled(hjb.Problem(drift, square, UNIT, discount=1.0), 1), 1)
+
+
+@pytest.mark.parametrize("kind", HELD)
+def test_a_digest_contains_what_a_host_function_holds(kind):
+    """A checkpoint of another problem would be continued, and a complete one be returned as the answer."""
+    one, other = HELD[kind]
+    assert digest_with(one()) == digest_with(one())
+    assert digest_with(one()) != digest_with(other())
+
+
+def test_a_digest_contains_the_globals_of_a_host_function(monkeypatch):
+    first = digest_with(read_through_a_global)
+    monkeypatch.setitem(SHARED, "gain", 2.0)
+    assert digest_with(read_through_a_global) != first
+
+
+@pytest.mark.filterwarnings("ignore:the primitive 'pure_callback'")
+@pytest.mark.slow
+def test_a_host_function_may_close_over_a_number():
+    """A traced number would reach NumPy while the program runs."""
+
+    def drift_of(gain):
+        def drift(x, u):
+            found = jax.pure_callback(
+                lambda y: gain * np.asarray(y), jax.ShapeDtypeStruct(x.shape, x.dtype), x, vmap_method="expand_dims"
+            )
+            return u - found
+
+        return drift
+
+    for gain in (0.5, 2.0):
+        called, known = (
+            hjb.solve(hjb.Problem(drift, square, UNIT, discount=1.0), LINE, scheme=hjb.Upwind(), tol=1e-9).value
+            for drift in (drift_of(gain), lambda x, u, gain=gain: u - gain * x)
+        )
+        np.testing.assert_allclose(called, known, atol=1e-12)
 
 
 @pytest.mark.slow

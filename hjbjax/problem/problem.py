@@ -73,7 +73,8 @@ class Problem:
       target: a function that is ≤ 0 inside the target, where paths end.
       exit_cost: the cost paid on the target; a number or a function. Default: zero.
       terminal_cost: V at the horizon, for ``march``.
-      stopping_cost: ψ, which the controller may pay to stop: V ≤ ψ.
+      stopping_cost: ψ, which the controller may pay to stop: V ≤ ψ. With a discount or a terminal cost, infinity
+        forbids stopping at a state.
       running_max: g, the cost is the running maximum of g: V ≥ g. Requires zero running cost and no discount.
       reward: the reward per unit time, maximised; utility, profit or income. Excludes all costs.
       exit_reward: the reward received on the target; a number or a function. Default: zero.

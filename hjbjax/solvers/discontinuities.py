@@ -14,6 +14,7 @@ is solved on a grid that is small enough to factor, with the mean of its right-h
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.types import Field
+from hjbjax.problem.types import DType, Field
 from hjbjax.solution.solution import Solution
 from hjbjax.solvers import factored_level, nested_grids
 from hjbjax.solvers.factored_level import Rows
@@ -54,37 +55,75 @@ def error_at_discontinuities(solution: Solution, task: Task) -> np.ndarray | Non
 
 def _jumps(solution: Solution, task: Task, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mean error of the rate H on the moves from each node, per unit time, and its cost on one move, (*grid)."""
-    grid, obstacles = task.grid, jax.device_get(task.obstacles)
-    # here in NumPy what needs no tracing, because small programs compile fast
-    x = [np.reshape(np.asarray(grid.axis(axis), value.dtype), along(grid, axis)) for axis in range(grid.ndim)]
-    loose = np.broadcast_to(np.logical_not(obstacles.fixed), grid.shape)
-    ways = [(axis, step) for axis in grid.state_axes for step in (-1, 1)]
-    # beyond the boundary of a target nothing is paid, and a cost may be undefined there
-    free = np.stack([_next_to(loose, grid, axis, step) for axis, step in ways])
-    signs = np.array([[step * (i == axis) for i in range(grid.ndim)] for axis, step in ways], value.dtype)
-    shifts = [
-        np.stack([_step(grid, axis, sign[axis]) for sign in signs]).astype(value.dtype) for axis in range(grid.ndim)
-    ]
+    obstacles = jax.device_get(task.obstacles)
     actions = tuple(None if each is None else np.asarray(each) for each in (solution.policy, solution.disturbance))
-    total, moving = jax.device_get(_missed(task.on.chain, x, actions, value, (shifts, signs, free)))
-    moves = np.asarray(obstacles.acting(value)) & (moving > 0)
+    loose = np.broadcast_to(np.logical_not(obstacles.fixed), task.grid.shape)
+    return error_on_moves(task.on.chain, actions, value, loose, np.asarray(obstacles.acting(value)))
+
+
+def error_on_moves(
+    on: Discretisation, actions: tuple, value: np.ndarray, loose: np.ndarray, acting: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mean error of the rate H on the moves from each node, per unit time, and its cost on one move, (*grid).
+
+    Args:
+      on: the problem on its grid, with the slopes of the chain.
+      actions: u and d, (*grid, m); None for a player that does not exist.
+      value: V, finite, (*grid).
+      loose: the nodes without a prescribed value, bool (*grid).
+      acting: the nodes at which actions matter, bool (*grid); there is no error elsewhere.
+    """
+    ways = directions(on.grid, value.dtype)
+    # beyond the boundary of a target nothing is paid, and a cost may be undefined there
+    free = np.stack([_next_to(loose, on.grid, axis, step) for axis, step in ways.neighbours])
+    total, moving = jax.device_get(_missed(on, actions, value, ways.steps, free))
+    moves = acting & (moving > 0)
     source = np.divide(total, moving, out=np.zeros_like(total), where=moves)
     return source, np.divide(source, moving, out=np.zeros_like(total), where=moves)
 
 
+class Directions(NamedTuple):
+    """The directions to the neighbours of the nodes.
+
+    Attributes:
+      neighbours: the axis and the sign of each direction.
+      steps: the coordinates of the nodes; for every axis the way to the neighbour in each direction; and each direction
+        as a unit vector.
+    """
+
+    neighbours: list[tuple[int, int]]
+    steps: tuple[list[np.ndarray], list[np.ndarray], np.ndarray]
+
+
+def directions(grid: Grid, dtype: DType) -> Directions:
+    """The directions to the neighbours on a grid, in NumPy, because small programs compile fast."""
+    x = [np.reshape(np.asarray(grid.axis(axis), dtype), along(grid, axis)) for axis in range(grid.ndim)]
+    ways = [(axis, step) for axis in grid.state_axes for step in (-1, 1)]
+    signs = np.array([[step * (i == axis) for i in range(grid.ndim)] for axis, step in ways], dtype)
+    shifts = [np.stack([_step(grid, axis, sign[axis]) for sign in signs]).astype(dtype) for axis in range(grid.ndim)]
+    return Directions(ways, (x, shifts, signs))
+
+
 @jax.jit
-def _missed(on: Discretisation, x: list, actions: tuple, value: Field, ways: tuple) -> tuple[Field, Field]:
+def _missed(on: Discretisation, actions: tuple, value: Field, steps: tuple, free: Field) -> tuple[Field, Field]:
+    """``rate_errors`` for actions of shape (*grid, m)."""
+    u, d = ([] if each is None else list(jnp.moveaxis(each, -1, 0)) for each in actions)
+    return rate_errors(on, (u, d), value, steps, free)
+
+
+def rate_errors(
+    on: Discretisation, actions: tuple[list, list], value: Field, steps: tuple, free: Field
+) -> tuple[Field, Field]:
     """The sum over all directions of the rate of moves times the error of H on them, and of the rates, (*grid).
 
     Args:
       on: the problem on its grid.
-      x: the coordinates of the nodes.
-      actions: u and d, (*grid, m).
+      actions: the components of u and of d, each (*grid).
       value: V.
-      ways: for every direction the way to the neighbour, one array per axis; the direction as a unit vector; and the
-        nodes whose neighbour is free.
+      steps: see ``Directions``.
+      free: for every direction the nodes whose neighbour is free, bool (directions, *grid).
     """
-    actions = tuple([] if each is None else list(jnp.moveaxis(each, -1, 0)) for each in actions)
+    x, shifts, signs = steps
     around = (value, [_slope(value, on.grid, x[axis], axis) for axis in range(on.grid.ndim)])
 
     def add(sums: tuple[Field, Field], way: tuple[list, jax.Array, Field]) -> tuple[tuple[Field, Field], None]:
@@ -93,7 +132,7 @@ def _missed(on: Discretisation, x: list, actions: tuple, value: Field, ways: tup
         return (sums[0] + jnp.where(free, missed, 0), sums[1] + rate), None
 
     zero = jnp.zeros(on.grid.shape, on.dtype)
-    return jax.lax.scan(add, (zero, zero), ways)[0]
+    return jax.lax.scan(add, (zero, zero), (shifts, signs, free))[0]
 
 
 def _missed_on(
@@ -117,7 +156,7 @@ def _missed_on(
     length, noise = sum(jnp.abs(step) for step in shift), on.diffusion(u, d)
     rate = jnp.maximum(f, 0) / length + sum(sign[i] ** 2 * a for (i, j), a in noise.items() if i == j) / (2 * length**2)
     # without noise, a path that comes to rest between x and y does not get to y
-    counts = jnp.isfinite(jump) & ((jnp.abs(f) > jnp.abs(beyond - f)) | (on.problem.noise is not None))
+    counts = jnp.isfinite(jump) & ((f * beyond > 0) | (on.problem.noise is not None))
     return jnp.where(counts, rate * jump, 0), rate
 
 

@@ -59,7 +59,7 @@ def policy_at(task: Task, value: Field) -> tuple[Field, Greedy]:
 def small_enough(task: Task) -> Task | None:
     """The task of the chain on a grid that is small enough to factor; None if the problem has none."""
     level = dataclasses.replace(task, on=task.on.chain)
-    grids = _coarser_grids(task.grid, int(np.clip(task.grid.size // SHARE, FEWEST, MOST)))
+    grids = coarser_grids(task.grid)
     while grids:
         coarse = on_coarser(level, grids.pop())
         if coarse is not None:
@@ -69,9 +69,9 @@ def small_enough(task: Task) -> Task | None:
     return dataclasses.replace(level, mesh=None) if fits else None
 
 
-def _coarser_grids(grid: Grid, wanted: int) -> list[Grid]:
-    """Ever coarser grids; the number of nodes of the last is closest to ``wanted``, as a ratio."""
-    grids = [grid]
+def coarser_grids(grid: Grid) -> list[Grid]:
+    """Ever coarser grids; the number of nodes of the last is closest to the wanted one, as a ratio."""
+    grids, wanted = [grid], int(np.clip(grid.size // SHARE, FEWEST, MOST))
     while grids[-1].size > wanted and (coarse := nested_grids.coarser(grids[-1], INTERVALS)) is not None:
         if coarse.size * grids[-1].size < wanted**2:
             break

@@ -248,11 +248,14 @@ def _on_host(asked: _Asked, clock: Clock) -> tuple[March, Solution]:
 
     Raises:
       Stopped: the clock stopped the march before the first step.
+      ValueError: V is not finite at the horizon.
     """
     on, horizon = asked.on, asked.horizon
     _check_nodes(on, horizon, clock, asked.mesh)
     task = _prepare(on, horizon, asked.method, asked.step, asked.inner, policy=asked.policy, mesh=asked.mesh)
     slices, front, code = march_run.drive_march(task, horizon, asked.kept, asked.start, clock)
+    if code is Status.NONFINITE and int(front.steps) == 0:
+        _refuse_at_horizon(on.problem, np.asarray(front.value), horizon)
     return task, march_run.assemble(task, on.grid, slices, front, code)
 
 
@@ -265,6 +268,17 @@ def _check_nodes(on: Discretisation, horizon: float, clock: Clock, mesh: Mesh | 
     for t in np.linspace(horizon, 0.0, PROBES) if problem.time_dependent else (0.0,):
         admissibility.check_constrained_ends(problem, on.grid, on.dtype, t)
     clock.enter("the preparation")
+
+
+def _refuse_at_horizon(problem: Problem, value: np.ndarray, horizon: float) -> None:
+    """Refuse a value at the horizon, (*grid), that is not finite."""
+    count = int(np.sum(~np.isfinite(value)))
+    if count:
+        words = [problem.labels.word(f"a {name}_cost") for name in ("terminal", "stopping")]
+        raise ValueError(
+            f"march: V is NaN or infinite at {count} of {value.size} nodes at the horizon, t = {horizon:g}; wanted "
+            f"finite numbers.\nWithout {words[0]}, V is {words[1]} there: pass {words[0]} that is finite"
+        )
 
 
 def _solution_at_horizon(asked: _Asked, code: Status) -> Solution:
@@ -452,7 +466,7 @@ def _march_traced(
     inner: float | None,
     throw: bool,
 ) -> Solution:
-    """The solution of a march inside a JAX transformation, in a scan of fixed length: no chunks, no value checks."""
+    """The solution of a march inside a JAX transformation, in a scan of fixed length: no chunks, fewer checks."""
     if step is None:
         raise ValueError(
             "march: inside jit, vmap and grad the number of steps must be known: pass step=, for explicit steps at "
@@ -468,7 +482,8 @@ def _march_traced(
     )  # fmt: skip
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
     touching: list[dict[str, Any]] = []
-    fine = _is_stable(on, method, horizon, step)
+    unmoved = on.asking(_without_moving_target(problem))
+    fine = _is_stable(on, method, horizon, step) & ~node_checks.state_fails(jax.lax.stop_gradient(unmoved))
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
         # without 1e-6 rounding could add a step to a whole number of steps; none if a kept time is the horizon
         steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))

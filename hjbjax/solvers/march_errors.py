@@ -30,6 +30,7 @@ from hjbjax.solvers import box_error, grid_error, march_run, nested_grids, time_
 from hjbjax.solvers.box_error import BoxError
 from hjbjax.solvers.coarser_answer import LOSES, OVER, TOO_FEW
 from hjbjax.solvers.grid_error import TwoGrids
+from hjbjax.solvers.march_discontinuities import error_along_paths
 from hjbjax.solvers.result import warn_of_grid
 from hjbjax.solvers.setup import march_evaluation
 
@@ -115,6 +116,9 @@ def _with_grid_error(
         if solution.times[i] < horizon:  # V is prescribed at the horizon
             answers = TwoGrids(grid, coarse.on.grid, value[i], before, held[i % len(held)], highest=highest)
             errors[i] = grid_error.estimate_error(answers)
+    missed = error_along_paths(solution, marched.task, marched.start, held)
+    if missed is not None:
+        errors = np.maximum(errors, missed.astype(errors.dtype))
     warn_of_grid(errors, value, "nodes and steps")
     for i in np.flatnonzero(solution.times < horizon):
         errors[i] += _left(marched, value[i])

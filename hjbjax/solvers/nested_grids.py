@@ -95,11 +95,11 @@ def resized(grid: Grid, shape: Sequence[int]) -> Grid:
 
 
 def _keeps(kinds: Sequence[np.ndarray], fine: Grid, coarse: Grid) -> bool:
-    """True if the coarser grid keeps each kind of nodes, see ``_keeps_nodes``."""
-    return all(_keeps_nodes(held, fine, coarse) for held in kinds)
+    """True if the coarser grid keeps each kind of nodes, see ``keeps_nodes``."""
+    return all(keeps_nodes(held, fine, coarse) for held in kinds)
 
 
-def _keeps_nodes(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
+def keeps_nodes(held: np.ndarray, fine: Grid, coarse: Grid) -> bool:
     """True if every node of ``held``, or a neighbour of it in ``held``, lies in a coarse cell with a corner in it."""
     if not np.any(held):
         return True

@@ -20,7 +20,7 @@ from hjbjax.discretisation.schemes import Upwind
 from hjbjax.problem import sets
 from hjbjax.problem.grid import Grid, division, tabulated
 from hjbjax.problem.layouts import Layout
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import Problem, is_discounted
 from hjbjax.problem.pytree import altered
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Mask, Numbers, Scalar, Verdict
@@ -211,7 +211,7 @@ def _part_passes(on: Discretisation, actions: tuple[Array, Array], first: Scalar
     """The verdict on the actions ``first``, …, ``last`` − 1; the first batch also checks functions of the state."""
     layout = on.grid.layout
     # functions of the state are checked once, with the first batch
-    amiss = jax.lax.cond(first == 0, lambda: _state_fails(on), lambda: jnp.zeros((), bool))
+    amiss = jax.lax.cond(first == 0, lambda: state_fails(on), lambda: jnp.zeros((), bool))
     x, tried = on.coordinates(), jax.tree.map(lambda rows: jnp.asarray(rows, on.dtype), actions)
 
     def look(k: Scalar, amiss: Verdict) -> Verdict:
@@ -223,7 +223,7 @@ def _part_passes(on: Discretisation, actions: tuple[Array, Array], first: Scalar
     return ~layout.some(jax.lax.fori_loop(first, last, look, amiss))
 
 
-def _state_fails(on: Discretisation) -> Verdict:
+def state_fails(on: Discretisation) -> Verdict:
     """True if ``check_values`` refuses the values of the functions of the state."""
     problem, some = on.problem, on.grid.layout.some
     amiss, inside = jnp.zeros((), bool), jnp.ones((), bool)
@@ -236,8 +236,18 @@ def _state_fails(on: Discretisation) -> Verdict:
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            amiss |= some(relevant & ~jnp.isfinite(on.at_nodes(ingredient)))
+            amiss |= some(relevant & ~_admissible(problem, name, on.at_nodes(ingredient)))
     return amiss
+
+
+def _admissible(problem: Problem, name: str, values: jax.Array) -> jax.Array:
+    """The nodes where a function of the state has an admissible value: a number, or no stopping, ψ = ∞.
+
+    Without a discount and a horizon ψ is the initial value of the iteration, and must be a number.
+    """
+    if name == "stopping_cost" and (problem.terminal_cost is not None or is_discounted(problem)):
+        return values > -jnp.inf
+    return jnp.isfinite(values)
 
 
 @jax.jit
@@ -257,7 +267,7 @@ def _survey(on: Discretisation, actions: tuple[Array, Array]) -> dict[str, Any]:
         ingredient = getattr(problem, name)
         if ingredient is not None:
             relevant = inside if name == "exit_cost" else True
-            found[name] = _count(relevant & ~jnp.isfinite(on.at_nodes(ingredient)), grid)
+            found[name] = _count(relevant & ~_admissible(problem, name, on.at_nodes(ingredient)), grid)
 
     def body(
         carry: dict[str, _Finding], index_and_action: tuple[Scalar, jax.Array, jax.Array]
@@ -375,8 +385,9 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
     """Refuse a function that is NaN or infinite at some nodes."""
     ingredient = getattr(problem, name)
     # a constant is wrong everywhere, so no node is named
+    finite = name in ("exit_cost", "stopping_cost")  # costs with which users forbid a set
     if not callable(ingredient):
-        cure = "; to forbid a set, use a number larger than any V, such as 1e3" if name == "exit_cost" else ""
+        cure = "; to forbid a set, use a number larger than any V, such as 1e3" if finite else ""
         word = problem.labels.word(name)
         raise ValueError(f"Problem.{word}: got {np.asarray(ingredient)}, wanted finite numbers{cure}")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
@@ -384,7 +395,7 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
         f"{call(problem, name)} is NaN or infinite at {where}.\n"
         "Keep the singularity out of the box (lo, hi) or between nodes (shape), or define the function there:\n"
         "jnp.where(bad, finite, f(jnp.where(bad, safe_x, x)))"
-        + ("\nTo forbid a set, use a number larger than any V, such as 1e3" if name == "exit_cost" else "")
+        + ("\nTo forbid a set, use a number larger than any V, such as 1e3" if finite else "")
     )
 
 

@@ -13,8 +13,9 @@ p, q, r, s, the slope from below is
 
 c = (0.1, 0.6, 0.3); the slope from above is its mirror image. At a kink the slope is as accurate as the best of three
 third-order stencils. The slopes in S_k are scaled by the range of V over the width of the box, so ε = 10⁻⁶ has no unit.
-Beyond an end the value is extrapolated quadratically, or mirrored where noise reflects; across a wall the slope is
-zero, as in every scheme here. The terms are ordered so that XLA fuses them into one loop without temporary arrays.
+Beyond an open end the value continues as a parabola, beyond a linear end as a line, and where noise reflects as its
+mirror image; across a wall the slope is zero, as in every scheme here. The terms are ordered so that XLA fuses them
+into one loop without temporary arrays.
 Source: G.-S. Jiang and D. Peng, Weighted ENO schemes for Hamilton–Jacobi equations, SIAM J. Sci. Comput. 21.
 """
 
@@ -115,14 +116,15 @@ def _continued(values: Field, grid: Grid, axis: int, reach: int, noisy: Noisy | 
     """``values`` with ``reach`` more entries at both ends of an axis."""
 
     def ended(step: int) -> jax.Array:
-        """The ``reach`` nearest entries beyond an end, from the parabola through its last three entries.
-
-        Where noise reflects they are the mirror image.
+        """The ``reach`` nearest entries beyond an end: on the parabola through its last three entries, or at a linear
+        end on the line through two. Where noise reflects they are the mirror image.
         """
         a, b, c, *far = (stencil.slices(values, grid, axis, step, k) for k in range(max(3, reach + 1)))
         along = [-1 if i == axis else 1 for i in range(grid.ndim)]
         # Lagrange polynomials on the points 0, 1, 2, evaluated at −3, −2 and −1; the upper end is the mirror image
-        weights = np.array([[10, -15, 6], [6, -8, 3], [3, -3, 1]])[3 - reach :][::-step].T.astype(values.dtype)
+        line = (axis, step) in grid.sides("linear")
+        known = [[4, -3, 0], [3, -2, 0], [2, -1, 0]] if line else [[10, -15, 6], [6, -8, 3], [3, -3, 1]]
+        weights = np.array(known)[3 - reach :][::-step].T.astype(values.dtype)
         first, second, third = (w.reshape(along) * node for w, node in zip(weights, (a, b, c), strict=True))
         found = first + second + third
         if (end := stencil.sloped(grid, axis, step)) is not None:  # the mirror image with the prescribed slope

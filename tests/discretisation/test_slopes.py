@@ -16,14 +16,21 @@ GRID = Grid([0.0, -1.0], [2.0, 3.0], SHAPE, (True, False))
 BOTH = jax.jit(lambda values: (slopes.eno2(values, GRID), slopes.weno5(values, GRID)))
 
 
-def line_through(values, axis, index, reach):
-    """The values from ``reach`` nodes before to ``reach`` after, wrapped or continued by the last parabola."""
+LINEAR = Grid([0.0, -1.0], [2.0, 3.0], SHAPE, (True, False), edges=(None, ("projected", "linear")))
+AT_A_LINEAR_END = jax.jit(lambda values: (slopes.eno2(values, LINEAR), slopes.weno5(values, LINEAR)))
+
+
+def line_through(values, axis, index, reach, degree=2):
+    """The values from ``reach`` nodes before to ``reach`` after, wrapped or continued by polynomials.
+
+    These are the parabola through the first three values and the polynomial of this degree through the last ones.
+    """
     row = np.take(values, index[1 - axis], axis=1 - axis)
     places = index[axis] + np.arange(-reach, reach + 1)
     if GRID.periodic[axis]:
         return row[places % len(row)]
     first = Polynomial.fit(np.arange(3), row[:3], 2)
-    last = Polynomial.fit(np.arange(-3, 0), row[-3:], 2)
+    last = Polynomial.fit(np.arange(-1 - degree, 0), row[-1 - degree :], degree)
     inside = (places >= 0) & (places < len(row))
     return np.where(
         inside, row[np.clip(places, 0, len(row) - 1)], np.where(places < 0, first(places), last(places - len(row)))
@@ -86,6 +93,32 @@ def test_slopes_are_those_of_fitted_polynomials(seed):
         up, down = (side[index] for side in second[axis])
         np.testing.assert_allclose(down, 0 if at_bottom else smoother(v5[:4], h), **close)
         np.testing.assert_allclose(up, 0 if at_top else -smoother(v5[:0:-1], h), **close)
+
+
+@pytest.mark.slow
+@given(SEEDS)
+def test_beyond_a_linear_end_the_value_is_a_line(seed):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=SHAPE) * 10.0 ** rng.integers(-6, 6)
+    index = int(rng.integers(SHAPE[0])), SHAPE[1] - 1 - int(rng.integers(3))
+    with jax.enable_x64(True):
+        second, fifth = jax.device_get(AT_A_LINEAR_END(jnp.asarray(values)))
+    extent, h = values.max() - values.min(), float(GRID.spacing(1))
+    typical = extent / float(GRID.hi[1] - GRID.lo[1])
+    v7, v5 = (line_through(values, 1, index, reach, degree=1) for reach in (3, 2))
+    found = [side[index] for side in (*second[1], *fifth[1])]
+    wanted = [-smoother(v5[:0:-1], h), smoother(v5[:4], h)]
+    wanted += [-weighted(v7[:0:-1], typical, h), weighted(v7[:6], typical, h)]
+    np.testing.assert_allclose(found, wanted, rtol=1e-7, atol=1e-7 * extent / h)
+
+
+@pytest.mark.parametrize("scheme", [slopes.eno2, slopes.weno5])
+def test_out_of_a_linear_end_the_slope_is_that_of_the_last_two_nodes(scheme):
+    x, grid = np.linspace(-1.0, 1.0, 9), Grid([-1.0], [1.0], (9,), edges="linear")
+    with jax.enable_x64(True):
+        ((up, down),) = jax.device_get(scheme(jnp.asarray(np.where(x == x[-1], 7.0, x)), grid))
+    np.testing.assert_allclose(down[0], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(up[-1], (7.0 - x[-2]) / 0.25, rtol=0.02)  # a fifth-order slope blends further nodes in
 
 
 @pytest.mark.parametrize("lo", [-1.0, 1.25, -5.25])  # two and a half cells from its top a far ghost bends less

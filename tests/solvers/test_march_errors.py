@@ -172,3 +172,18 @@ def test_a_coarse_march_warns():
     case = CASES["jump"]
     with pytest.warns(hjb.SolveWarning, match="above a tenth of the range of V at .* of the nodes"):
         hjb.march(case.problem, line(-2.0, 2.0, 41, edges="open"), 1.0)
+
+
+@pytest.mark.parametrize("way", ["default", "upwind", "weno"])
+@pytest.mark.parametrize("edges", ["open", "linear"])
+def test_an_end_that_optimal_paths_leave_by_has_an_error(edges, way):
+    """x' = u, |u| ≤ 1, and a terminal cost ψ that falls to the right: V = ψ(x + T − t), which no value inside tells."""
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: 0.0, UNIT, terminal_cost=lambda x: 1 / (1 + jnp.exp(3 * x[0])))
+    grid = line(-1.0, 1.0, 41, edges=edges)
+    solution = hjb.march(problem, grid, 0.5, **WAYS[way])
+    error = np.abs(solution.value[0] - 1 / (1 + np.exp(3 * (grid.axis(0) + 0.5))))
+    assert solution.box_error is not None, solution.stats["box_error"]
+    estimate = solution.grid_error[0] + solution.box_error[0]
+    wrong = error > 0.01 * np.ptp(solution.value[0])
+    assert np.any(wrong)
+    assert np.all(estimate[wrong] > error[wrong] / 3)

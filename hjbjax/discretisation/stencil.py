@@ -95,18 +95,23 @@ def continuation(grid: Grid, axis: int, step: int) -> tuple[Number, ...]:
         return step * 2 * _last_gap(grid, axis, step) * end.rate, 1.0
     if grid.stretch[axis] is None:
         return 3.0, -3.0, 1.0
-    gaps = jnp.diff(jnp.asarray(undivided(grid).axis(axis)))
+    gaps = _gaps(grid, axis)
     last, before = (gaps[-1], gaps[-2]) if step > 0 else (gaps[0], gaps[1])
     # Newton's form of the parabola at a distance ``last`` beyond the end; equal gaps give 3, −3, 1
     ratio, bend = last / before, 2 * last / (last + before)
     return 2 + bend, -(1 + bend + bend * ratio), bend * ratio
 
 
+def _gaps(grid: Grid, axis: int) -> jax.Array:
+    """The distances between the nodes along an axis, (N − 1,), in the type of the corners of the grid."""
+    return jnp.diff(jnp.asarray(undivided(grid).axis(axis, jnp.result_type(grid.spacing(axis)))))
+
+
 def _last_gap(grid: Grid, axis: int, step: int) -> Number:
     """The distance between the end of an axis and the node next to it."""
     if grid.stretch[axis] is None:
         return grid.spacing(axis)
-    gaps = jnp.diff(jnp.asarray(undivided(grid).axis(axis)))
+    gaps = _gaps(grid, axis)
     return gaps[-1] if step > 0 else gaps[0]
 
 
@@ -267,7 +272,7 @@ def grid_links(grid: Grid, axis: int) -> Links:
     """The links of the grid along one axis; on a stretched axis an end node repeats its only distance."""
     if grid.stretch[axis] is None:
         return Links(grid.spacing(axis), grid.spacing(axis))
-    gaps = jnp.diff(jnp.asarray(undivided(grid).axis(axis)))
+    gaps = _gaps(grid, axis)
     along = [-1 if i == axis else 1 for i in range(grid.ndim)]
     # N − 1 gaps for N nodes: beyond an end is the mirror image, or a parabola over a gap of the same length
     up, down = jnp.append(gaps, gaps[-1:]), jnp.append(gaps[:1], gaps)

@@ -367,6 +367,16 @@ def as_jax(tree: T) -> T:
     return jax.tree.map(convert, tree)
 
 
+def in_type(tree: T, dtype: DType) -> T:
+    """The tree with its NumPy arrays of floating-point numbers in ``dtype``; host level."""
+
+    def convert(leaf: Any) -> Any:
+        is_known = isinstance(leaf, np.ndarray) and np.issubdtype(leaf.dtype, np.floating)
+        return leaf.astype(dtype) if is_known else leaf
+
+    return jax.tree.map(convert, tree)
+
+
 def cast(tree: T, dtype: DType) -> T:
     """The tree with its floating-point leaves in ``dtype``; integers and booleans are unchanged."""
 

@@ -10,7 +10,7 @@ from hjbjax.discretisation.discretisation import Discretisation, Scheme
 from hjbjax.iteration.fixed_point import State, Task
 from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
-from hjbjax.problem.pytree import altered
+from hjbjax.problem.pytree import altered, in_type
 from hjbjax.problem.types import Nodes
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.status import Status
@@ -119,7 +119,7 @@ def _ends(task: Task) -> np.ndarray:
 
 def on_coarser(task: Task, coarse: Grid) -> Task | None:
     """The task on a coarser grid; None if that grid would change the question."""
-    fine = task.grid
+    fine, coarse = task.grid, in_type(coarse, task.on.dtype)
     strides = [divmod(fine.intervals(axis), coarse.intervals(axis)) for axis in range(fine.ndim)]
     # ``outflow``, the rate of the fastest action, depends on the spacings
     if task.outflow is None and not any(rest for _, rest in strides):

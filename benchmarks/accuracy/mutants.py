@@ -110,8 +110,8 @@ MUTANTS = (
     Mutant(
         "width of the ghost cells of Eno2",
         "discretisation/slopes.py",
-        "[3, -3, 1]])[3 - reach :]",
-        "[3, -3, 1]])[:reach]",
+        "np.array(known)[3 - reach :]",
+        "np.array(known)[:reach]",
         ("tests/discretisation/test_slopes.py",),
     ),
     Mutant(

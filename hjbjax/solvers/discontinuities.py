@@ -105,14 +105,14 @@ def directions(grid: Grid, dtype: DType) -> Directions:
 
 
 @jax.jit
-def _missed(on: Discretisation, actions: tuple, value: Field, steps: tuple, free: Field) -> tuple[Field, Field]:
+def _missed(on: Discretisation, actions: tuple, value: Field, steps: tuple, free: jax.Array) -> tuple[Field, Field]:
     """``rate_errors`` for actions of shape (*grid, m)."""
     u, d = ([] if each is None else list(jnp.moveaxis(each, -1, 0)) for each in actions)
     return rate_errors(on, (u, d), value, steps, free)
 
 
 def rate_errors(
-    on: Discretisation, actions: tuple[list, list], value: Field, steps: tuple, free: Field
+    on: Discretisation, actions: tuple[list, list], value: Field, steps: tuple, free: jax.Array
 ) -> tuple[Field, Field]:
     """The sum over all directions of the rate of moves times the error of H on them, and of the rates, (*grid).
 
@@ -174,7 +174,7 @@ def _next_to(nodes: np.ndarray, grid: Grid, axis: int, step: int) -> np.ndarray:
     return found
 
 
-def _slope(value: Field, grid: Grid, x: Field, axis: int) -> Field:
+def _slope(value: Field, grid: Grid, x: jax.Array, axis: int) -> Field:
     """The slope of V along an axis by central differences, one-sided at the ends of the box."""
     if axis not in grid.state_axes:
         return jnp.zeros_like(value)

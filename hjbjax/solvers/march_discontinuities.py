@@ -81,7 +81,7 @@ def _small_enough(grid: Grid, held: np.ndarray) -> Grid | None:
 
 
 @jax.jit
-def _marched(task: March, start: Field | None, steps: tuple, ends: jax.Array) -> Field:
+def _marched(task: March, start: Field | None, steps: tuple, ends: jax.Array) -> jax.Array:
     """The error e at the ends of intervals of time, from the horizon back, (k, *grid)."""
     value = time_stepping.terminal(task.on.at(task.horizon), start)
 

@@ -148,4 +148,16 @@ def _weighted(a: Field, b: Field, c: Field, d: Field, e: Field) -> Field:
     last = (13 / 12 * (s - r) ** 2 + (s - 3 * r) ** 2 / 4 + EPSILON) ** 2
     # c_k/(ε + S_k)² over one common denominator, so a slope takes one division instead of four
     w0, w1, w2 = 0.1 * (middle * last), 0.6 * (first * last), 0.3 * (first * middle)
-    return c + (w0 * (5 * q - 2 * p) + w1 * (2 * r + q) + w2 * (4 * r - s)) / (6 * (w0 + w1 + w2))
+    return c + _quotient(w0 * (5 * q - 2 * p) + w1 * (2 * r + q) + w2 * (4 * r - s), 6 * (w0 + w1 + w2))
+
+
+@jax.custom_jvp
+def _quotient(over: Field, under: Field) -> Field:
+    """``over`` / ``under``. JAX's derivative squares ``under``, and ε⁸ is zero in float32."""
+    return over / under
+
+
+@_quotient.defjvp
+def _derivative_of_the_quotient(primals: tuple[Field, Field], tangents: tuple[Field, Field]) -> tuple[Field, Field]:
+    found = _quotient(*primals)
+    return found, (tangents[0] - found * tangents[1]) / primals[1]

@@ -137,3 +137,19 @@ def test_a_constant_is_flat():
     ((up, down),) = slopes.weno5(jnp.full(9, 3.0), Grid([-1.0], [3.0], (9,)))
     assert not np.any(up)
     assert not np.any(down)
+
+
+def test_the_derivative_of_smooth_slopes_is_finite_in_single_precision():
+    """Where V is a line the sum of the weights is about ε⁴, whose square is zero in float32."""
+    x, bump = np.linspace(-1.0, 1.0, 9), np.exp(-((np.linspace(-1.0, 1.0, 9)) ** 2))
+    grid = Grid([-1.0], [1.0], (9,))
+
+    def slope(a, dtype):
+        ((up, down),) = slopes.weno5(jnp.asarray(x, dtype) + a * jnp.asarray(bump, dtype), grid)
+        return up + 2 * down
+
+    with jax.enable_x64(True):
+        exact = jax.jacfwd(lambda a: slope(a, "float64"))(jnp.zeros((), "float64"))
+        for jacobian in (jax.jacfwd, jax.jacrev):
+            found = jacobian(lambda a: slope(a, "float32"))(jnp.zeros((), "float32"))
+            np.testing.assert_allclose(found, exact, rtol=1e-4, atol=1e-4)

@@ -129,9 +129,7 @@ def _closed_loops(problem: Problem, solution: Solution, seen: Observations, coun
         return jax.lax.scan(step, x, jnp.arange(count))[0], x
 
     times = jnp.asarray(seen.times - seen.times[0])
-    last, before = jax.lax.scan(
-        interval, jnp.asarray(seen.states[:, 0]), jnp.stack([times[:-1], times[1:]], axis=1)
-    )  # fmt: skip
+    last, before = jax.lax.scan(interval, jnp.asarray(seen.states[:, 0]), jnp.stack([times[:-1], times[1:]], axis=1))
     states = jnp.concatenate([before, last[None]])
     return jnp.moveaxis(states, 0, 1), jnp.moveaxis(control(times[:, None], states), 0, 1)
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # coordinates by axis number or name; three types, because a type checker does not accept {0: 1.0} for the last one
 Cuts: TypeAlias = Mapping[int, float] | Mapping[str, float] | Mapping[int | str, float]
-STOP, PUSH = "stop", "push"  # the labels of the stopping set and of a push region, which the direction follows
+STOP, PUSH = "stop", "push"  # the labels of the stopping set and of a push region; its direction is added
 CHUNK = 1 << 16  # number of states evaluated at once, to bound the memory of intermediate arrays
 RASTER = 301  # points per axis for the outline of a set; a disc a tenth of the plot wide has 30 across
 ON_NODE = 1e-9  # fraction of a cell: a coordinate this close to a node means the node, so 0.1 + 0.2 means 0.3
@@ -158,8 +158,7 @@ def _masks(known: Described, grid: Grid) -> dict[str, np.ndarray]:
     for number, push in enumerate(pushes):
         axis, sign = push.step
         name = f"{PUSH} {grid.names[axis]} {'up' if sign > 0 else 'down'}"
-        mask = np.asarray(known.pushing)[..., number]
-        found[name] = found[name] | mask if name in found else mask
+        found[name] = np.asarray(known.pushing)[..., number]
     return found
 
 

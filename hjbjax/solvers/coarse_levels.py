@@ -119,6 +119,7 @@ def _ends(task: Task) -> np.ndarray:
 
 def on_coarser(task: Task, coarse: Grid) -> Task | None:
     """The task on a coarser grid; None if that grid would change the question."""
+    # a float64 corner would make the whole chain float64 while JAX is set to 64 bits
     fine, coarse = task.grid, in_type(coarse, task.on.dtype)
     strides = [divmod(fine.intervals(axis), coarse.intervals(axis)) for axis in range(fine.ndim)]
     # ``outflow``, the rate of the fastest action, depends on the spacings

@@ -385,9 +385,9 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
     """Refuse a function that is NaN or infinite at some nodes."""
     ingredient = getattr(problem, name)
     # a constant is wrong everywhere, so no node is named
-    finite = name in ("exit_cost", "stopping_cost")  # costs with which users forbid a set
+    forbids = name in ("exit_cost", "stopping_cost")  # users forbid a set with a large cost
     if not callable(ingredient):
-        cure = "; to forbid a set, use a number larger than any V, such as 1e3" if finite else ""
+        cure = "; to forbid a set, use a number larger than any V, such as 1e3" if forbids else ""
         word = problem.labels.word(name)
         raise ValueError(f"Problem.{word}: got {np.asarray(ingredient)}, wanted finite numbers{cure}")
     where = _where(problem, grid, finding, actions if name in OF_ACTION else None)
@@ -395,7 +395,7 @@ def _refuse_not_finite(problem: Problem, grid: Grid, name: str, finding: _Findin
         f"{call(problem, name)} is NaN or infinite at {where}.\n"
         "Keep the singularity out of the box (lo, hi) or between nodes (shape), or define the function there:\n"
         "jnp.where(bad, finite, f(jnp.where(bad, safe_x, x)))"
-        + ("\nTo forbid a set, use a number larger than any V, such as 1e3" if finite else "")
+        + ("\nTo forbid a set, use a number larger than any V, such as 1e3" if forbids else "")
     )
 
 

@@ -177,7 +177,7 @@ def test_a_coarse_march_warns():
 @pytest.mark.parametrize("way", ["default", "upwind", "weno"])
 @pytest.mark.parametrize("edges", ["open", "linear"])
 def test_an_end_that_optimal_paths_leave_by_has_an_error(edges, way):
-    """x' = u, |u| ≤ 1, and a terminal cost ψ that falls to the right: V = ψ(x + T − t), which no value inside tells."""
+    """x' = u, |u| ≤ 1, and a terminal cost ψ that falls to the right: V = ψ(x + T − t), also beyond the end."""
     problem = hjb.Problem(lambda x, u: u, lambda x, u: 0.0, UNIT, terminal_cost=lambda x: 1 / (1 + jnp.exp(3 * x[0])))
     grid = line(-1.0, 1.0, 41, edges=edges)
     solution = hjb.march(problem, grid, 0.5, **WAYS[way])

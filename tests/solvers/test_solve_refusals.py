@@ -134,7 +134,7 @@ def test_functions_that_are_not_finite_at_nodes(name):
     grid = hjb.Grid([0.0, -2.0], [1.0, 2.0], (8, 10))  # 1/x₁ is infinite at the 10 nodes of the first row
 
     def pole(x, *rest):
-        return (-1.0 if name == "stopping_cost" else 1.0) / x[0] - 1.5  # a stopping cost of +∞ only forbids to stop
+        return (-1.0 if name == "stopping_cost" else 1.0) / x[0] - 1.5  # a stopping cost of +∞ forbids stopping
 
     def poles(x, *rest):
         return jnp.stack([pole(x), x[1]])

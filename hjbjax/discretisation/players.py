@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.pytree import remembered
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex, is_unbounded
 from hjbjax.tracing import dependence
 from hjbjax.tracing.operations import Operations
@@ -153,6 +154,7 @@ class Players:
         return all(player.exact or player.enumerated for player in self.both)
 
 
+@remembered
 def find_players(problem: Problem, n: int, dtype: Any) -> Players:
     """The players of a problem with ``n`` states, read from its functions."""
     found = dependence.influence(problem, n, dtype)

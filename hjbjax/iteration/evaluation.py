@@ -378,7 +378,7 @@ def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) ->
     def on_host(source: Array, far: list, *weights: Array) -> np.ndarray:
         landings = [Landing(nodes, numbers(rate), back) for (nodes, rate), back in zip(far, backwards, strict=True)]
         given = [numbers(w) for w in weights]
-        delta = factor_and_solve(offsets, given, numbers(source), grid, landings=landings, transposed=transposed)
+        delta = factored(offsets, given, grid, landings=landings, transposed=transposed)(numbers(source))
         return np.ascontiguousarray(delta.astype(dtype)).view(word).reshape(source.shape)
 
     # a double is two words on an additional axis, a single is one word
@@ -391,23 +391,22 @@ def direct(equation: PolicyEquation, grid: Grid, *, transposed: bool = False) ->
     return jax.lax.bitcast_convert_type(delta, dtype)
 
 
-def factor_and_solve(
+def factored(
     offsets: Sequence[tuple[int, ...]],
     weights: list[np.ndarray],
-    source: np.ndarray,
     grid: Grid,
     *,
     landings: Sequence[Landing] = (),
     transposed: bool = False,
-) -> np.ndarray:
-    """Solve (I − W) δ = s, or its transpose; NaN if the matrix is singular."""
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The function s ↦ (I − W)⁻¹ s of arrays (*grid), or of the transpose; NaN if the matrix is singular."""
     from scipy.sparse.linalg import splu
 
     # I − W with the nodes in C order; CSC is what SuperLU factors
     far = [each.weighed(-1) for each in landings]
     matrix = stencil.sparse(offsets, [-w for w in weights], np.ones(grid.shape), grid, far)
     try:
-        delta = splu(matrix.tocsc()).solve(source.ravel(), "T" if transposed else "N")
+        factors = splu(matrix.tocsc())
     except RuntimeError:  # exactly singular, such as an improper policy; the solve detects the NaN
-        delta = np.full(grid.size, np.nan)
-    return delta.reshape(grid.shape)
+        return lambda source: np.full(grid.shape, np.nan)
+    return lambda source: factors.solve(source.ravel(), "T" if transposed else "N").reshape(grid.shape)

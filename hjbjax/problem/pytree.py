@@ -61,20 +61,26 @@ def pytree_dataclass(*, static: Iterable[str] = (), host: Iterable[str] = ()) ->
         if not leaves and "__eq__" not in vars(cls):
             _compare_by_value(cls, static)
 
+        keys = tuple(map(jax.tree_util.GetAttrKey, leaves))
+
+        def flatten(self: Any) -> tuple[list[Any], tuple[Any, ...]]:
+            return [getattr(self, name) for name in leaves], tuple([getattr(self, name) for name in static])
+
         # with keys, so that JAX names a leaf in its messages as the user does: ``.discount``
         def flatten_with_keys(self: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
-            children = [(jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in leaves]
-            return children, tuple(getattr(self, name) for name in static)
+            children, aux = flatten(self)
+            return list(zip(keys, children, strict=True)), aux
 
         def unflatten(aux: tuple[Any, ...], children: Iterable[Any]) -> Any:
             self = object.__new__(cls)  # skips __init__ and the lock of a frozen dataclass
-            for name, value in (*zip(leaves, children, strict=True), *zip(static, aux, strict=True)):
-                object.__setattr__(self, name, value)
+            values = vars(self)
+            values.update(zip(leaves, children, strict=True))
+            values.update(zip(static, aux, strict=True))
             for name, make in defaults.items():
-                object.__setattr__(self, name, make())
+                values[name] = make()
             return self
 
-        jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten)
+        jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
         return cls
 
     return register

@@ -173,14 +173,18 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     value, scale = start, np.ptp(counted := start[np.asarray(level.counted)])
     if _is_flat(counted):
         return BoxError(None, FLAT)
-    moved = np.zeros(grid.shape, bool)
+    change, moved, solve = np.zeros_like(start), np.zeros(grid.shape, bool), None
     for step in range(STEPS):
         rows = _equation(others, value, obstacles, defect)
+        source = np.asarray(rows.source)
         if step == 0:
-            moved = np.abs(np.asarray(rows.source)) > ROUNDING * scale
+            moved = np.abs(source) > ROUNDING * scale
             if not np.any(moved):
                 return BoxError(None, NEVER_REACHED)
-        delta = rows.solved(grid)
+        # the last factors are good enough for the step that ends the iteration
+        if solve is None or np.max(np.abs(delta := solve(source))) > SETTLED * np.max(change):
+            solve = rows.factored(grid)
+            delta = solve(source)
         value, largest = value + delta, np.max(np.abs(delta))
         change = np.abs(value - start)
         if not np.isfinite(largest) or np.max(change) > FARTHEST * scale:

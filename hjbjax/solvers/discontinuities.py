@@ -190,7 +190,8 @@ def _along_paths(level: Task, value: np.ndarray, source: np.ndarray, fine: Grid)
     """The total of the source along the paths of the chain on a coarser grid, (*level.grid); None if it is infinite."""
     restricted = jnp.asarray(nested_grids.restrict(value, fine, level.grid), level.tol.dtype)
     mean = jnp.asarray(nested_grids.mean_around(source, fine, level.grid), level.tol.dtype)
-    error = _accumulation(level, *factored_level.policy_at(level, restricted), mean).solved(level.grid)
+    rows = _accumulation(level, *factored_level.policy_at(level, restricted), mean)
+    error = rows.factored(level.grid)(np.asarray(rows.source))
     return error if np.all(np.isfinite(error)) else None
 
 

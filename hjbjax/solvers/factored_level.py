@@ -1,6 +1,7 @@
 """A coarse grid on which linear equations are factored, for estimates that need no fine one."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ from hjbjax.discretisation import stencil
 from hjbjax.discretisation.landing import Landing
 from hjbjax.iteration import bellman
 from hjbjax.iteration.bellman import Greedy, PolicyEquation
-from hjbjax.iteration.evaluation import factor_and_solve
+from hjbjax.iteration.evaluation import factored
 from hjbjax.iteration.fixed_point import Task
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Field
@@ -30,10 +31,10 @@ class Rows(NamedTuple):
     weights: dict[tuple[int, ...], Field]
     landings: tuple[Landing, ...]
 
-    def solved(self, grid: Grid) -> np.ndarray:
-        """δ, (*grid), in NumPy; NaN if the matrix is singular."""
-        source, weights, landings = jax.device_get(tuple(self))
-        return factor_and_solve(list(weights), list(weights.values()), source, grid, landings=landings)
+    def factored(self, grid: Grid) -> Callable[[np.ndarray], np.ndarray]:
+        """δ as a function of the source, arrays (*grid) in NumPy; NaN if the matrix is singular."""
+        weights, landings = jax.device_get((self.weights, self.landings))
+        return factored(list(weights), list(weights.values()), grid, landings=landings)
 
 
 def rows_of(equation: PolicyEquation, grid: Grid) -> Rows:

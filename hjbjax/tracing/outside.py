@@ -8,7 +8,7 @@ each new one would cost seconds of compilation.
 because a number that a function closes over is part of its computation. The numbers in cells and globals are therefore
 found and passed to a copy of the function as arguments, so they become leaves of the problem. A number stays in the
 function if it is used for more than arithmetic: an exponent determines how a cost depends on the control, an integer
-may be a shape, a comparison may choose between two branches.
+may be a shape, a comparison with another number may choose between two branches.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ CALLBACKS = ("pure_callback", "io_callback")
 # libraries whose functions do not change; a problem that only uses these does not have to be traced
 LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
 # operations with a number that do not change the kind of dependence on a state or a control
-ARITHMETIC = frozenset({"add", "add_any", "sub", "mul", "div", "max", "min", "atan2", "dot_general", "concatenate"})
+ARITHMETIC = frozenset(
+    {"add", "add_any", "sub", "mul", "div", "max", "min", "clamp", "atan2", "dot_general", "concatenate"}
+    | {"gt", "ge", "lt", "le", "select_n"}
+)
 CALLED = frozenset({"jit", "pjit"})  # the same primitive in different versions of JAX
 INSIDE = "."  # between the name of a function and the name that it reads
 FLOATS = (float, np.floating)
@@ -314,7 +317,10 @@ class OfNumbers:
 
 
 def _reading(function: Any, numbers: dict[str, Any]) -> Any:
-    """A copy of a function that reads ``numbers`` instead; ``helper.name`` is the name in a function that it calls."""
+    """A copy of a function, or of a tuple that it reads, with ``numbers`` instead of its own.
+
+    ``helper.name`` is the name in a function that it calls, and ``pair.0`` the first number of a tuple.
+    """
     values: dict[str, Any] = {}
     for name, number in numbers.items():
         helper, _, inner = name.partition(INSIDE)
@@ -322,6 +328,8 @@ def _reading(function: Any, numbers: dict[str, Any]) -> Any:
             values.setdefault(helper, {})[inner] = number
         else:
             values[name] = number
+    if isinstance(function, tuple):
+        return tuple(values.get(str(i), each) for i, each in enumerate(function))
     if isinstance(function, Composite):
         outer, *inside = (_reading(each, values[str(i)]) if str(i) in values else each for i, each in _each(function))
         return Composite(outer, function.structure, inside)
@@ -342,8 +350,9 @@ def _reading(function: Any, numbers: dict[str, Any]) -> Any:
 def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 6) -> dict[str, np.ndarray]:
     """Numbers of these kinds, and real arrays, in the cells and globals that a function's own code names.
 
-    Functions in its cells are included, as ``helper.name``: a drift may call a helper defined next to it. The functions
-    of ``Composite`` are called 0, 1, 2 and so on. Rewards and discounts of the state add up to three levels of the
+    Functions in its cells are included, as ``helper.name``: a drift may call a helper defined next to it. Numbers in
+    tuples are included as ``pair.0``; lists are not, because they may change while the function runs. The functions of
+    ``Composite`` are called 0, 1, 2 and so on. Rewards and discounts of the state add up to three levels of the
     package's own functions.
     """
     if isinstance(function, Composite):
@@ -353,6 +362,9 @@ def numbers_read(function: Callable, kinds: tuple[type, ...], depth: int = 6) ->
         return {}
     read = _read(function)
     found = {name: np.asarray(each, float) for name, each in read.items() if _is_number(each, kinds)}
+    for name, thing in read.items():
+        members = enumerate(thing) if type(thing) is tuple else ()
+        found |= {f"{name}{INSIDE}{i}": np.asarray(each, float) for i, each in members if _is_number(each, kinds)}
     for name in function.__code__.co_freevars:
         inside = numbers_read(read[name], kinds, depth - 1) if isinstance(read[name], types.FunctionType) else {}
         found |= {f"{name}{INSIDE}{each}": number for each, number in inside.items()}
@@ -428,5 +440,7 @@ def _follow(jaxpr: jex.Jaxpr, owners: dict[jex.Var, frozenset[int]]) -> tuple[se
             owners |= {var: each for var, each in zip(eqn.outvars, results, strict=True) if each}
         elif touched and eqn.primitive.name not in ARITHMETIC:
             deciding |= touched
+        elif eqn.primitive.name == "select_n":
+            deciding |= frozenset().union(*read[:1])  # numbers that choose between two functions of the state
     ends = [owners.get(cast("jex.Var", each), frozenset()) for each in jaxpr.outvars]  # literals have no owners
     return deciding, ends

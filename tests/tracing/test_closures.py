@@ -218,7 +218,7 @@ def test_numbers_that_decide_stay_in_the_code():
 
     def ask(power, entry, bound, flag):
         def cost(x, u):
-            held = jnp.where(x[entry] > bound, 1.0, 0.0) + jnp.zeros(entry + 1)[entry]
+            held = jnp.where(bound < 0.5, 2 * x[entry], 0 * x[entry]) + jnp.zeros(entry + 1)[entry]
             return (u @ u) ** power + held if flag else x @ x
 
         return closures.settled(hjb.Problem(steer, cost, UNIT), 1).cost
@@ -235,6 +235,46 @@ def test_numbers_that_decide_stay_in_the_code():
         marks.add(found.func.mark)
         assert jax.jit(found)(x, u) == pytest.approx((u @ u) ** power + (bound < 0.5) if flag else 0.25)
     assert len(marks) == 4
+
+
+def test_thresholds_and_tuples_are_numbers():
+    """Numbers that are compared with the state or chosen by it are leaves, so a sweep over them shares a program."""
+
+    def ask(wall, costs, ends):
+        low, high = ends
+        at = lambda x, u: jnp.where(x[0] > wall, costs[1], costs[0]) * jnp.sum(u**2) + jnp.clip(x[0], low, high)  # noqa: E731
+        return closures.settled(hjb.Problem(steer, at, UNIT), 1).cost
+
+    marks = set()
+    for wall, costs, ends in ((0.25, (1.0, 3.0), (-1.0, 0.125)), (0.75, (2.0, 5.0), (0.0, 9.0))):
+        found = ask(wall, costs, ends)
+        marks.add(found.func.mark)
+        for x in (0.125, 0.5, 1.0):
+            wanted = costs[x > wall] * 0.09 + np.clip(x, *ends)
+            assert jax.jit(found)(np.array([x]), np.array([0.3])) == pytest.approx(wanted, rel=1e-6)
+    assert len(marks) == 1
+
+
+def test_a_tuple_of_a_shape_stays_in_the_code():
+    def ask(shape, gain):
+        return closures.settled(hjb.Problem(lambda x, u: gain[0] * u + jnp.zeros(shape), square, UNIT), 1).drift
+
+    found = ask((1,), (2.0, None))
+    assert jax.jit(found)(np.ones(1), np.ones(1)) == pytest.approx(2.0)
+    assert ask((1,), (3.0, None)).func.mark == found.func.mark
+
+
+@pytest.mark.slow
+def test_a_sweep_over_thresholds_compiles_nothing_again():
+    def value(wall, costs):
+        cost = lambda x, u: jnp.where(x[0] > wall, costs[1], costs[0])  # noqa: E731
+        return hjb.solve(hjb.Problem(lambda x, u: 1 + 0 * u, cost, UNIT, discount=1.0), LINE, scheme=hjb.Upwind()).value
+
+    value(0.1, (1.0, 2.0))
+    programs, found = compiled(lambda: value(0.3, (0.5, 4.0)))
+    assert programs == 0
+    written = hjb.Problem(lambda x, u: 1 + 0 * u, lambda x, u: jnp.where(x[0] > 0.3, 4.0, 0.5), UNIT, discount=1.0)
+    np.testing.assert_allclose(found, hjb.solve(written, LINE, scheme=hjb.Upwind()).value, rtol=1e-9)
 
 
 def test_a_function_that_counts_its_calls_still_does():

@@ -46,16 +46,17 @@ DOORS = {
     "solve": lambda problem, grid: hjb.solve(problem, grid, dtype="float32").value,
     "march": lambda problem, grid: hjb.march(problem, grid, 0.5, step=0.005, dtype="float32").value[0],
 }
-QUICK = [("solve", "discounted")]
+GRIDS = {"uniform": UNIFORM, "stretched": STRETCHED}
 CASES = [
-    pytest.param(door, kind, marks=[] if (door, kind) in QUICK else pytest.mark.slow)
+    pytest.param(door, kind, GRIDS[name], id=f"{door}-{kind}-{name}", marks=marks)
     for door in DOORS
     for kind in MAKERS
+    for name in GRIDS
+    for marks in [[] if (door, kind, name) == ("solve", "discounted", "stretched") else pytest.mark.slow]
 ]
 
 
-@pytest.mark.parametrize("grid", [UNIFORM, STRETCHED], ids=["uniform", "stretched"])
-@pytest.mark.parametrize(("door", "kind"), CASES)
+@pytest.mark.parametrize(("door", "kind", "grid"), CASES)
 def test_a_transformed_solve_in_float32_is_that_of_the_host(door, kind, grid):
     def total(a):
         return DOORS[door](MAKERS[kind](a), grid).sum()

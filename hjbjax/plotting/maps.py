@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hjbjax.plotting.histories import inputs_over_time, modes_over_time, states_over_time
-from hjbjax.plotting.modes import by_mode
+from hjbjax.plotting.modes import by_mode, name_mode
 from hjbjax.plotting.scales import scale_axes, time_label
 from hjbjax.plotting.shading import (
     EXTREME,
@@ -406,6 +406,8 @@ def closed_loop(
         cut: Cuts = {axis: float(start[axis]) for axis in range(grid.ndim) if axis not in axes}
         ax = styled(figure.add_subplot(columns[:, 0]))
         artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed, target=target)
+        if modes:
+            name_mode(ax, modes[int(np.asarray(path.modes)[0])])
         # a section has its axes in the order of the grid
         drawn = trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
         for mark, name in zip(drawn, (_path_name(path, grid, axes), "start", "end"), strict=True):

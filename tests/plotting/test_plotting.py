@@ -966,6 +966,14 @@ def test_states_of_different_units_have_axes_of_their_own_and_so_has_the_mode():
     assert saved(picture)
 
 
+def test_a_picture_of_one_mode_names_it_once():
+    solution = two_modes(pushed=False)
+    ax = plotting.value(solution, fixed={"mode": 1}).ax
+    assert ax.get_title("right") == "mode poor"
+    plotting.policy(solution, fixed={"mode": 1}, ax=ax)
+    assert ax.get_title("right") == "mode poor"
+
+
 def test_the_mode_of_a_path_is_drawn_under_its_states():
     solution = two_modes(pushed=False)
     path = path_of([[0.1], [0.5], [0.9]], np.zeros((2, 1)))

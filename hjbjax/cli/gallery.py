@@ -42,7 +42,7 @@ SYMBOLS = "In the pictures T is the time until the target is reached, β the dis
 # number of nodes by number of states: cells of two to four pixels over two axes, in seconds once compiled
 NODES = {2: 40_000, 3: 400_000}
 MOST = 20_000  # for other numbers of states
-TOL = 1e-6  # cost units; with the default tolerance a switching curve wanders where V is nearly constant
+TOL = 1e-6  # cost units, over two states or more; by default a switching curve wanders where V is nearly constant
 DPI = 100  # as in the other pages; labels of 9 points are legible
 
 
@@ -119,8 +119,10 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
         # put warnings on the card instead of the terminal, which shows one line per problem
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always", SolveWarning)
-            scheme = {"scheme": hjb.SemiLagrangian()} if entry.kinked else {}
-            solution = hjb.solve(problem, grid, throw=False, **({"tol": TOL} | scheme | (options or {})))
+            chosen: dict[str, Any] = {"tol": TOL} if grid.ndim > 1 else {}
+            if entry.kinked:
+                chosen["scheme"] = hjb.SemiLagrangian()
+            solution = hjb.solve(problem, grid, throw=False, **(chosen | (options or {})))
     except (SolveError, ValueError, jax.errors.JaxRuntimeError) as error:
         return Card(entry.name, entry.summary, type(error).__name__, (("refused", " ".join(str(error).split())),), ())
     if solution.status == Status.INTERRUPTED:

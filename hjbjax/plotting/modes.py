@@ -54,9 +54,9 @@ def by_mode(draw: T) -> T:
             return draw(solution, *arguments, **options)
         if MODE in cuts or solution.grid.ndim - 1 - len(cuts) != 1:
             one, rest = in_fixed_mode(solution, fixed)
-            picture = draw(one, *arguments, **(options | {"fixed": rest}))
-            name_mode(picture.ax, modes[mode_number(solution.grid, cuts[MODE], "fixed")])
-            return picture
+            drawn_mode = draw(one, *arguments, **(options | {"fixed": rest}))
+            name_mode(drawn_mode.ax, modes[mode_number(solution.grid, cuts[MODE], "fixed")])
+            return drawn_mode
         ax, artists = axes_of(options.get("ax")), []
         for number, name in enumerate(modes):
             picture: Any = draw(solution.in_mode(number), *arguments, **(options | {"ax": ax}))

@@ -291,7 +291,7 @@ def add_colorbar(ax: Axes, mesh: Any, label: str) -> Any:
     above = label.replace(" [", "\n[")
     above = above.replace(" = ", " =\n") if max(map(len, above.split("\n"))) > WORDY else above
     # in points, because a tick at the upper end is half as high as its digits on any bar
-    place = offset_copy(bar.ax.transAxes, fig=bar.ax.figure, y=CLEARANCE, units="points")
+    place = offset_copy(bar.ax.transAxes, fig=bar.ax.get_figure(root=True), y=CLEARANCE, units="points")
     bar.ax.text(0.0, 1.0, above, transform=place, ha="left", va="bottom", fontsize=9, gid="label")
     return bar
 

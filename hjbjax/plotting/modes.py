@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound="Callable[..., Picture]")
 MODE = "mode"  # the name of the axis of modes
+PALE = 0.4  # opacity of the pattern of a set
 
 
 def in_fixed_mode(solution: Solution, fixed: Cuts | None) -> tuple[Solution, Cuts | None]:
@@ -81,8 +82,8 @@ def name_mode(ax: Axes, mode: str) -> None:
 
 def _name_set(band: Artist, mode: str, number: int) -> None:
     """Give a set of one mode the colour of its line, and add the mode to its name, if it has one."""
-    # without a face, because the sets of two modes may overlap
-    band.set(facecolor="none", edgecolor=line_look(number)["color"])
+    # without a face, because the sets of two modes may overlap; pale, because the line has the same colour
+    band.set(facecolor="none", edgecolor=(line_look(number)["color"], PALE))
     label = str(band.get_label())
     if not label.startswith("_"):  # matplotlib's own labels, which are not in a legend
         band.set_label(f"{label}, {mode}")

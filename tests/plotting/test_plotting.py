@@ -828,6 +828,7 @@ def test_sets_of_two_modes_have_names_and_colours_of_their_own():
     for mode in ("rich", "poor"):
         colour = look[mode].get_color()
         assert to_hex(look[f"push cash down, {mode}"].get_edgecolor()) == colour
+        assert look[f"push cash down, {mode}"].get_edgecolor()[3] < 0.5  # otherwise it hides the line of its colour
     assert look["rich"].get_color() != look["poor"].get_color()
     assert look["rich"].get_linestyle() != look["poor"].get_linestyle()
     assert len({look[name].get_hatch() for name in names if "push" in name}) == 3

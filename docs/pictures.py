@@ -110,6 +110,8 @@ def gallery_page(cards: list[gallery.Card]) -> str:
         "`hjbjax gallery --out FOLDER` makes this page on your machine. `hjbjax solve NAME` solves one problem on its",
         "own grid.",
         "",
+        gallery.SYMBOLS,
+        "",
     ]
     for card in cards:
         lines += [f"## {card.name}", "", f"{card.summary[0].upper()}{card.summary[1:]}: {card.status}.", ""]

@@ -38,9 +38,11 @@ if TYPE_CHECKING:
     from hjbjax.zoo.entry import Entry
 
 PAGE = "index.html"
+SYMBOLS = "In the pictures T is the time until the target is reached, β the discount rate and E[·] the expectation."
 # number of nodes by number of states: cells of two to four pixels over two axes, in seconds once compiled
 NODES = {2: 40_000, 3: 400_000}
 MOST = 20_000  # for other numbers of states
+TOL = 1e-6  # cost units, over two states or more; by default a switching curve wanders where V is nearly constant
 DPI = 100  # as in the other pages; labels of 9 points are legible
 
 
@@ -117,8 +119,10 @@ def card(entry: Entry, *, options: dict[str, Any] | None = None) -> Card:
         # put warnings on the card instead of the terminal, which shows one line per problem
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always", SolveWarning)
-            scheme = {"scheme": hjb.SemiLagrangian()} if entry.kinked else {}
-            solution = hjb.solve(problem, grid, throw=False, **(scheme | (options or {})))
+            chosen: dict[str, Any] = {"tol": TOL} if grid.ndim > 1 else {}
+            if entry.kinked:
+                chosen["scheme"] = hjb.SemiLagrangian()
+            solution = hjb.solve(problem, grid, throw=False, **(chosen | (options or {})))
     except (SolveError, ValueError, jax.errors.JaxRuntimeError) as error:
         return Card(entry.name, entry.summary, type(error).__name__, (("refused", " ".join(str(error).split())),), ())
     if solution.status == Status.INTERRUPTED:
@@ -237,7 +241,7 @@ def page(cards: Sequence[Card]) -> str:
         f"<style>{STYLE}</style></head>\n<body><h1>The ready problems of hjbjax</h1>\n"
         f"<p>{good} of {len(cards)} converged, by hjbjax {__version__} on {html.escape(_device())}, on grids for "
         "pictures. <code>hjbjax solve NAME</code> takes the grid of the problem.</p>\n"
-        f"<nav>{links}</nav>\n{''.join(map(_section, cards))}</body></html>\n"
+        f"<p>{SYMBOLS}</p>\n<nav>{links}</nav>\n{''.join(map(_section, cards))}</body></html>\n"
     )
 
 

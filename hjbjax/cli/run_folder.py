@@ -28,6 +28,7 @@ from hjbjax.feedback.path import Path as Trajectory
 from hjbjax.feedback.path import join_paths
 from hjbjax.feedback.simulation import simulate
 from hjbjax.plotting.maps import closed_loop_size
+from hjbjax.plotting.modes import name_mode
 from hjbjax.plotting.slices import at_states
 from hjbjax.plotting.slices import feedback as feedback_of
 from hjbjax.plotting.style import NARROW, save_figure
@@ -308,7 +309,7 @@ def crossing_time(path: Trajectory, grid: Grid, duration: float) -> float:
 class _Part(NamedTuple):
     """The solution of one plot: of all modes over one state, otherwise of one mode."""
 
-    title: str
+    mode: str
     solution: Solution
     target: Callable | None
 
@@ -320,7 +321,7 @@ def _parts(problem: Problem, solution: Solution) -> list[_Part]:
         return [_Part("", solution, problem.target)]
     if len(solution.grid.state_axes) == 1:  # the plot has one line per mode
         return [_Part("", solution, None)]
-    return [_Part(f"mode {name}", solution.in_mode(name), target_in(problem, name)) for name in modes]
+    return [_Part(name, solution.in_mode(name), target_in(problem, name)) for name in modes]
 
 
 def target_in(problem: Problem, mode: str | None) -> Callable | None:
@@ -331,11 +332,12 @@ def target_in(problem: Problem, mode: str | None) -> Callable | None:
 def plot_values(problem: Problem, solution: Solution, fixed: dict[int, float], jumps: bool) -> "Figure":
     """The value; with modes over two states one plot per mode, side by side."""
     parts = _parts(problem, solution)
-    figure, axes_of_parts = _panels([part.title for part in parts])
+    figure, axes_of_parts = _panels(len(parts))
     for ax, part in zip(axes_of_parts, parts, strict=True):
         drawn = plotting.value(part.solution, ax=ax, fixed=fixed, target=part.target)
         with_curve(drawn, part.solution, fixed, jumps)
-        _name_mode(ax, part.title)
+        if part.mode:
+            name_mode(ax, part.mode)
     return figure
 
 
@@ -343,13 +345,14 @@ def plot_policies(problem: Problem, solution: Solution, fixed: dict[int, float],
     """One plot per input and, over two states, per mode, side by side; without constant feedbacks if others vary."""
     inputs = [(part, input) for input in range(solution.policy.shape[-1]) for part in _parts(problem, solution)]
     inputs = [each for each in inputs if constant_input(each[0].solution, each[1], fixed) is None] or inputs
-    figure, axes_of_inputs = _panels([part.title for part, _ in inputs])
+    figure, axes_of_inputs = _panels(len(inputs))
     if not inputs:
         figure.text(0.5, 0.5, "this problem has no control", ha="center", va="center", color="0.4")
     for ax, (part, input) in zip(axes_of_inputs, inputs, strict=True):
         drawn = plotting.policy(part.solution, input=input, fixed=fixed, ax=ax)
         with_curve(drawn, part.solution, fixed, jumps, input)
-        _name_mode(ax, part.title)
+        if part.mode:
+            name_mode(ax, part.mode)
     return figure
 
 
@@ -367,19 +370,12 @@ def constant_input(solution: Solution, input: int, fixed: dict[int, float]) -> f
     return middle if float(np.mean(np.abs(known - middle) <= CONSTANT * abs(middle))) > NEARLY else None
 
 
-def _name_mode(ax: "Axes", mode: str) -> None:
-    """Write the mode in front of the caption, at the right end, since the legend is at the left one."""
-    if mode:
-        caption = ax.get_title("right")
-        ax.set_title(f"{mode}, {caption}" if caption else mode, loc="right", fontsize=9)
-
-
-def _panels(titles: Sequence[str]) -> tuple["Figure", list["Axes"]]:
-    """A figure with one plot per title, side by side."""
-    figure = figure_of((NARROW[0] * max(1, len(titles)), NARROW[1]))
-    if not titles:
+def _panels(count: int) -> tuple["Figure", list["Axes"]]:
+    """A figure with ``count`` plots side by side."""
+    figure = figure_of((NARROW[0] * max(1, count), NARROW[1]))
+    if not count:
         return figure, []
-    return figure, [plotting.styled(ax) for ax in figure.subplots(1, len(titles), squeeze=False)[0]]
+    return figure, [plotting.styled(ax) for ax in figure.subplots(1, count, squeeze=False)[0]]
 
 
 def with_curve(

@@ -8,9 +8,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hjbjax.plotting.histories import inputs_over_time, modes_over_time, states_over_time
-from hjbjax.plotting.modes import by_mode
+from hjbjax.plotting.modes import by_mode, name_mode
 from hjbjax.plotting.scales import scale_axes, time_label
-from hjbjax.plotting.shading import EXTREME, Look, cross_out, dot_region, draw, fill_missing, frame, is_level, jumps
+from hjbjax.plotting.shading import (
+    EXTREME,
+    FLAT,
+    Look,
+    cross_out,
+    dot_region,
+    draw,
+    fill_missing,
+    frame,
+    is_level,
+    jumps,
+)
 from hjbjax.plotting.slices import (
     Cuts,
     Region,
@@ -34,7 +45,8 @@ from hjbjax.plotting.style import COLOURS, Picture, axes_of, drawing, label_axes
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.types import Number, State
 
-SMOOTHING = 1.5  # width of the mean of signs at a switching curve, in cells
+SMOOTHING = 0.015  # width of the mean of signs at a switching curve, as a fraction of the axis
+CELLS = (1.5, 3.0)  # its limits in cells; a staircase takes 1.5, and beyond 3 the mean would move a curved line
 TIE = 0.3  # relative difference between the neighbours of an extremum of V that is within 0.15 cells of the node
 BANG_BANG = 0.98  # fraction of nodes at an end of the range; the others are on a switching curve
 SURE = 0.999  # mean of signs beyond which all neighbours have one sign
@@ -271,12 +283,20 @@ def _mean_signs(section: Section, tied: np.ndarray) -> np.ma.MaskedArray:
     values, mask = section.values, np.ma.getmaskarray(section.values)
     signs = np.where(mask | tied, 0.0, np.sign(values.filled(0.0)))
     modes = ["grid-wrap" if section.grid.periodic[axis] else "nearest" for axis in section.axes]
+    widths = [float(np.clip(SMOOTHING * section.grid.shape[axis], *CELLS)) for axis in section.axes]
     total, weight = (
-        closed_field(gaussian_filter(_open(field, section), SMOOTHING, mode=modes), section.grid, section.axes)
+        closed_field(gaussian_filter(_open(field, section), widths, mode=modes), section.grid, section.axes)
         for field in (signs, 1.0 - mask)
     )
     # rounded, otherwise a curve along a face of the box would be broken by rounding errors
-    return np.ma.array(np.round(total / np.where(mask, 1.0, weight), DIGITS), mask=mask)
+    means = np.round(total / np.where(mask, 1.0, weight), DIGITS)
+    for position, axis in enumerate(section.axes):
+        if section.grid.periodic[axis]:
+            rows = np.moveaxis(means, position, 0)
+            # a curve along the seam is drawn at both ends; matplotlib draws a zero there only below a positive number
+            for seam, inner in ((0, 1), (-1, -2)):
+                rows[seam] = np.where(rows[seam] == 0, -(0.1**DIGITS) * rows[inner], rows[seam])
+    return np.ma.array(means, mask=mask)
 
 
 def _open(field: np.ndarray, section: Section) -> np.ndarray:
@@ -386,9 +406,11 @@ def closed_loop(
         cut: Cuts = {axis: float(start[axis]) for axis in range(grid.ndim) if axis not in axes}
         ax = styled(figure.add_subplot(columns[:, 0]))
         artists += value(solution, ax=ax, fixed=cut if fixed is None else fixed, target=target)
+        if modes:
+            name_mode(ax, modes[int(np.asarray(path.modes)[0])])
         # a section has its axes in the order of the grid
         drawn = trajectory(path, ax=ax, axes=axes if axes[0] < axes[1] else axes[::-1], grid=grid)
-        for mark, name in zip(drawn, ("path", "start", "end"), strict=True):
+        for mark, name in zip(drawn, (_path_name(path, grid, axes), "start", "end"), strict=True):
             mark.set_label(name)
         legend(ax)
         artists += drawn
@@ -409,6 +431,14 @@ def closed_loop(
         panel.tick_params(labelbottom=False)
     panels[-1].set_xlabel(time_label(grid, described(solution).labels))
     return Picture(artists, ax if plane else panels[0])
+
+
+def _path_name(path: Path, grid: Grid, axes: tuple[int, int]) -> str:
+    """The label of a path in the plane of two axes; it is a projection if another state varies."""
+    states = np.asarray(path.states)
+    spans = np.asarray(grid.hi) - np.asarray(grid.lo)
+    moves = [np.ptp(states[:, axis]) > FLAT * spans[axis] for axis in range(grid.ndim) if axis not in axes]
+    return "path, projected" if any(moves) else "path"
 
 
 def _rows(solution: Solution, path: Path) -> list[tuple[str, list[int]]]:

@@ -1,4 +1,4 @@
-"""Pictures of solutions with modes: one mode, or over one state all modes in one picture.
+"""Pictures of solutions with modes: one mode, which the caption names, or over one state all modes in one picture.
 
 Over one state each mode has its own line, and its sets, such as a push region, have the colour of the line and a
 name that includes the mode.
@@ -12,14 +12,17 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from hjbjax.plotting.slices import Cuts
 from hjbjax.plotting.style import Picture, axes_of, legend, line_look
+from hjbjax.solution.modes import mode_number
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
 
     from hjbjax.solution.solution import Solution
 
 T = TypeVar("T", bound="Callable[..., Picture]")
 MODE = "mode"  # the name of the axis of modes
+PALE = 0.4  # opacity of the pattern of a set
 
 
 def in_fixed_mode(solution: Solution, fixed: Cuts | None) -> tuple[Solution, Cuts | None]:
@@ -52,14 +55,16 @@ def by_mode(draw: T) -> T:
             return draw(solution, *arguments, **options)
         if MODE in cuts or solution.grid.ndim - 1 - len(cuts) != 1:
             one, rest = in_fixed_mode(solution, fixed)
-            return draw(one, *arguments, **(options | {"fixed": rest}))
+            drawn_mode = draw(one, *arguments, **(options | {"fixed": rest}))
+            name_mode(drawn_mode.ax, modes[mode_number(solution.grid, cuts[MODE], "fixed")])
+            return drawn_mode
         ax, artists = axes_of(options.get("ax")), []
         for number, name in enumerate(modes):
             picture: Any = draw(solution.in_mode(number), *arguments, **(options | {"ax": ax}))
             line, *sets = picture
             line.set(label=name, **line_look(number))
             for each in sets:
-                _name_mode(each, name, number)
+                _name_set(each, name, number)
             artists += list(picture)
         ax.relim()
         ax.autoscale(axis="y")
@@ -68,10 +73,17 @@ def by_mode(draw: T) -> T:
     return cast(T, drawn)
 
 
-def _name_mode(band: Artist, mode: str, number: int) -> None:
+def name_mode(ax: Axes, mode: str) -> None:
+    """Write the mode of a picture in front of its caption, at the right end, since the legend is at the left one."""
+    caption, words = ax.get_title("right"), f"{MODE} {mode}"
+    if not caption.startswith(words):  # several pictures may share these axes
+        ax.set_title(f"{words}, {caption}" if caption else words, loc="right", fontsize=9)
+
+
+def _name_set(band: Artist, mode: str, number: int) -> None:
     """Give a set of one mode the colour of its line, and add the mode to its name, if it has one."""
-    # without a face, because the sets of two modes may overlap
-    band.set(facecolor="none", edgecolor=line_look(number)["color"])
+    # without a face, because the sets of two modes may overlap; pale, because the line has the same colour
+    band.set(facecolor="none", edgecolor=(line_look(number)["color"], PALE))
     label = str(band.get_label())
     if not label.startswith("_"):  # matplotlib's own labels, which are not in a legend
         band.set_label(f"{label}, {mode}")

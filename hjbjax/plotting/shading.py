@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
 
+CLEARANCE = 8.0  # points from the top of a colour bar to its label; a tick label at the top takes half of them
 WORDY = 10  # characters next to each other above a colour bar; more are broken at the equals sign
 FLAT = 1e-4  # relative variation below which a field is drawn as constant, as left by a solve of a constant V
 OBSTACLE = "obstacle"  # the label of a set that is drawn solid
@@ -180,11 +181,11 @@ def hatched(ax: Axes, coordinates: tuple[np.ndarray, ...], level: np.ndarray, la
 
 
 def outlined(ax: Axes, region: Region, *, inside: bool = True) -> list[Artist]:
-    """Outline a set, and hatch it if ``inside``; draws nothing if the set is not in the picture."""
+    """Outline a set, and hatch it if ``inside``; a set that is too thin for an outline is drawn by its nodes."""
     from matplotlib.patches import Rectangle
 
     if not region.visible:
-        return []
+        return _marked(ax, region)
     artists: list[Artist] = []
     new = region.label not in ax.get_legend_handles_labels()[1]
     if region.label == OBSTACLE:  # solid, and not hatched or empty like a target
@@ -204,6 +205,15 @@ def outlined(ax: Axes, region: Region, *, inside: bool = True) -> list[Artist]:
             ax.contour(*region.coordinates, region.level.T, levels=[0.0], colors="black", linewidths=1.0, zorder=2.5)
         )
     return artists
+
+
+def _marked(ax: Axes, region: Region) -> list[Artist]:
+    """Mark the nodes of a set that is a point or thinner than a line; draws nothing if it has none."""
+    if not len(region.points):
+        return []
+    label = region.label if region.label not in ax.get_legend_handles_labels()[1] else None
+    style: dict[str, Any] = {"marker": "D", "color": "black", "markersize": 4, "markeredgecolor": "white"}
+    return [*ax.plot(*region.points.T, linestyle="none", markeredgewidth=0.6, zorder=3, label=label, **style)]
 
 
 def dot_region(
@@ -233,7 +243,7 @@ def dot_region(
         (x,) = section.coordinates
         ends = [*x[:1][inside[:1]], *points_of(x, values, inside, None), *x[-1:][inside[-1:]]]
         for k, (left, right) in enumerate(zip(ends[::2], ends[1::2], strict=True)):
-            artists.append(ax.axvspan(left, right, linewidth=0, zorder=0, label=None if k else name, **style))
+            artists.append(ax.axvspan(left, right, linewidth=0.6, zorder=0, label=None if k else name, **style))
     else:
         area: Any = {"levels": [0.0, 1.0], "colors": "white" if cover else "none", "hatches": [pattern], "zorder": 2}
         dots = ax.contourf(*section.coordinates, inside.T - 0.5, **area)
@@ -272,6 +282,7 @@ def _pattern(ax: Axes) -> str:
 def add_colorbar(ax: Axes, mesh: Any, label: str) -> Any:
     """Draw the colour bar of a mesh, with a horizontal label above it."""
     from matplotlib.ticker import FuncFormatter
+    from matplotlib.transforms import offset_copy
 
     bar = ax.figure.colorbar(mesh, ax=ax, fraction=0.06, pad=0.03, format=FuncFormatter(number_text))
     bar.outline.set_visible(False)
@@ -279,7 +290,9 @@ def add_colorbar(ax: Axes, mesh: Any, label: str) -> Any:
     # a text, because the layout reserves room for it but not for a title; the unit goes below the name, to save width
     above = label.replace(" [", "\n[")
     above = above.replace(" = ", " =\n") if max(map(len, above.split("\n"))) > WORDY else above
-    bar.ax.text(0.0, 1.02, above, transform=bar.ax.transAxes, ha="left", va="bottom", fontsize=9, gid="label")
+    # in points, because a tick at the upper end is half as high as its digits on any bar
+    place = offset_copy(bar.ax.transAxes, fig=bar.ax.get_figure(root=True), y=CLEARANCE, units="points")
+    bar.ax.text(0.0, 1.0, above, transform=place, ha="left", va="bottom", fontsize=9, gid="label")
     return bar
 
 
@@ -290,7 +303,7 @@ def bands(ax: Axes, x: np.ndarray, mask: np.ndarray, label: str) -> list[Artist]
     cells = np.diff(x) / 2 if len(x) > 1 else np.array([0.5])  # half of each cell, because an axis may be stretched
     borders = np.concatenate([[x[0] - cells[0]], x[:-1] + cells[: len(x) - 1], [x[-1] + cells[-1]]])
     runs = zip(edges[::2], edges[1::2], strict=True)
-    style: dict[str, Any] = {"facecolor": "white", "edgecolor": STROKE, "hatch": HATCH, "linewidth": 0, "zorder": 0}
+    style: dict[str, Any] = {"facecolor": "white", "edgecolor": STROKE, "hatch": HATCH, "linewidth": 1.0, "zorder": 0}
     return [ax.axvspan(borders[a], borders[b], label=None if k else label, **style) for k, (a, b) in enumerate(runs)]
 
 

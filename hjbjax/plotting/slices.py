@@ -75,16 +75,25 @@ def described(solution: "Solution | None") -> Described:
 
 
 class Region(NamedTuple):
-    """A set in the plane of a section: its name, a fine raster with its function, ≤ 0 inside, and the nodes inside."""
+    """A set in the plane of a section.
+
+    Args:
+      label: its name.
+      coordinates: of a fine raster.
+      level: the function of the set on the raster, ≤ 0 inside.
+      nodes: True for the nodes inside, of the shape of the section.
+      points: the coordinates of the nodes inside that are not on a face of the box, (k, 2).
+    """
 
     label: str
     coordinates: tuple[np.ndarray, ...]
     level: np.ndarray
     nodes: np.ndarray
+    points: np.ndarray
 
     @property
     def visible(self) -> bool:
-        """True if the set is as wide as a line; a point, or a face of the box, is not drawn."""
+        """True if the set is as wide as a line, so that its outline can be seen."""
         inside = self.level < 0
         return bool(np.any(inside[:-2, :-2] & inside[2:, :-2] & inside[:-2, 2:] & inside[2:, 2:]))
 
@@ -98,7 +107,13 @@ def region_of(function: Callable[[State], Number], section: Section, label: str)
     checks.function_of(function, label, (), x=(section.grid.ndim,))
     fine = tuple(np.linspace(line[0], line[-1], RASTER) for line in section.coordinates)
     level, nodes = (at_states(function, section.states(lines)) for lines in (fine, section.coordinates))
-    return Region(label, fine, np.where(np.isfinite(level), level, 1.0), nodes <= 0)
+    inner = np.ones(nodes.shape, bool)
+    for position, axis in enumerate(section.axes):
+        if not section.grid.periodic[axis]:  # a set may be a face of the box, which the frame already draws
+            np.moveaxis(inner, position, 0)[[0, -1]] = False
+    places = np.argwhere((nodes <= 0) & inner)
+    points = np.stack([line[places[:, i]] for i, line in enumerate(section.coordinates)], axis=-1)
+    return Region(label, fine, np.where(np.isfinite(level), level, 1.0), nodes <= 0, points)
 
 
 def at_time(solution: "Solution", field: Array, time: float | None) -> tuple[np.ndarray, str]:

@@ -199,6 +199,7 @@ def styled(ax: Axes) -> Axes:
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_linewidth(0.8)
     ax.tick_params(width=0.8, length=3, labelsize=9)
+    ax.tick_params(axis="x", pad=5.5)  # otherwise the first tick labels of both axes nearly touch
     ax.xaxis.label.set_fontsize(10)
     ax.yaxis.label.set_fontsize(10)
     return ax

@@ -79,7 +79,8 @@ def thermostat(
     system = Thermostat(leak, outside, heating, wanted, fuel)
     modes = Modes(("off", "on"), switching_cost=two_modes(wear, wear))
     problem = Problem(system.drift, system.cost, noise=noise, discount=discount, modes=modes, time_unit="h")
-    return problem, Grid([10.0], [30.0], shape, names=("temperature",), units=("°C",))
+    # the temperature continues beyond the box; a wall that reflects the noise would bend V there
+    return problem, Grid([10.0], [30.0], shape, names=("temperature",), units=("°C",), edges="open")
 
 
 @pytree_dataclass()

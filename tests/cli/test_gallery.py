@@ -211,6 +211,20 @@ def test_a_refusal_is_a_card_and_an_interrupt_none(monkeypatch):
         card(zoo.catalogue["smooth"])
 
 
+def test_a_card_is_solved_to_the_tolerance_of_pictures_unless_the_caller_gives_one(monkeypatch):
+    asked = []
+
+    def refuse(problem, grid, **options):
+        asked.append(options.get("tol"))
+        raise ValueError("not now")
+
+    monkeypatch.setattr(hjbjax, "solve", refuse)
+    for name in ("pursuit", "double-integrator", "bang-bang"):
+        card(zoo.catalogue[name])
+    card(zoo.catalogue["smooth"], options={"tol": 0.1})
+    assert asked == [gallery.TOL, gallery.TOL, None, 0.1]  # over one state there is no curve
+
+
 def test_a_control_that_jumps_is_held_while_the_path_crosses_a_cell():
     grid = hjbjax.Grid([0.0, 0.0], [1.0, 8.0], (11, 9))
     times = np.linspace(0.0, 10.0, 101)

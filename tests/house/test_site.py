@@ -49,6 +49,16 @@ def test_every_public_name_has_an_entry():
     assert len(entries) == len(set(entries))
 
 
+@pytest.mark.parametrize("page", ["getting_started", "troubleshooting"])
+def test_code_on_the_first_pages_fits_the_column(page):
+    """At a width of 1280 pixels the column has room for 90 characters."""
+    text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```\w+\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    lines = "".join(blocks).splitlines()
+    assert len(lines) > 30
+    assert [line for line in lines if len(line) > 90] == []
+
+
 def test_docstrings_keep_their_bars_and_stars_and_equations():
     lines = ["The bound |V − V_h|.", "", "    V* = min", "", "Args:", "  x_: the ``|x|`` of it.", "", ">>> 2 * 3", "6"]
     wanted = [

@@ -2,6 +2,7 @@
 
 import errno
 import io
+import itertools
 import os
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from pictures import hatched_nodes, scale_label
+from pictures import clearance, hatched_nodes, scale_label, texts
 from pictures import pictures as plotting
 
 from hjbjax import plotting as on_current_axes
@@ -279,6 +280,20 @@ def test_over_one_axis_a_target_is_called_one_and_not_a_place_without_a_control(
     for asked, said in ((problem, "target"), (None, "no control")):
         solution = made(line().grid, lambda x: x[..., 0] ** 2, lambda x: np.where(x == 0, np.nan, -x), problem=asked)
         assert labels(plotting.policy(solution).ax) == [said]
+
+
+def test_a_target_of_one_node_is_an_outlined_band_over_one_axis():
+    """Of 201 nodes a cell is narrower than a hatch, so only its outline is visible."""
+    problem = Problem(lambda x, u: u, lambda x, u: 1.0, Box([-1.0], [1.0]), target=lambda x: jnp.abs(x[0]) - 1e-9)
+    solution = made(
+        line(201).grid, lambda x: x[..., 0] ** 2, lambda x: np.where(np.isclose(x, 0), np.nan, -x), problem=problem
+    )
+    _, band = plotting.policy(solution)
+    assert band.get_x() < 0 < band.get_x() + band.get_width() < 0.02
+    assert band.get_linewidth() >= 1
+    assert band.get_edgecolor()[3] == 1
+    (swatch,) = band.axes.get_legend().get_patches()
+    assert swatch.get_linewidth() > 0
 
 
 def test_enumerated_controls_are_cut_at_the_nearest_node():
@@ -813,6 +828,7 @@ def test_sets_of_two_modes_have_names_and_colours_of_their_own():
     for mode in ("rich", "poor"):
         colour = look[mode].get_color()
         assert to_hex(look[f"push cash down, {mode}"].get_edgecolor()) == colour
+        assert look[f"push cash down, {mode}"].get_edgecolor()[3] < 0.5  # otherwise it hides the line of its colour
     assert look["rich"].get_color() != look["poor"].get_color()
     assert look["rich"].get_linestyle() != look["poor"].get_linestyle()
     assert len({look[name].get_hatch() for name in names if "push" in name}) == 3
@@ -846,6 +862,25 @@ def test_a_target_as_thin_as_a_face_of_the_box_is_not_in_the_legend():
         assert (labels(ax) == ["target"]) == shown
 
 
+def test_a_target_of_a_few_nodes_is_marked_at_these_nodes():
+    grid = Grid([-1.0, -1.0], [1.0, 1.0], (201, 201))
+    solution = made(grid, lambda x: np.linalg.norm(x, axis=-1))
+    three = [(0.5, -0.01), (0.5, 0.0), (0.5, 0.01)]
+    for target, nodes in (
+        (lambda x: jnp.sum(x**2) - 1e-9, [(0.0, 0.0)]),
+        (lambda x: jnp.maximum(jnp.abs(x[0] - 0.5) - 1e-6, jnp.abs(x[1]) - 0.015), three),
+    ):
+        picture = plotting.value(solution, target=target)
+        assert labels(picture.ax) == ["target"]
+        (marks,) = picture.ax.get_lines()
+        np.testing.assert_allclose(marks.get_xydata(), nodes, atol=1e-12)
+        assert marks.get_linestyle() == "None"
+        assert marks.get_markersize() >= 3
+        assert saved(picture)
+    wide = plotting.value(solution, target=lambda x: jnp.sum(x**2) - 0.01)
+    assert not wide.ax.get_lines()
+
+
 def test_where_the_ends_of_the_box_decide_the_value_is_crossed_out():
     grid = Grid([-1.0, -1.0], [1.0, 1.0], (21, 21))
     x = grid.nodes()[..., 0]
@@ -876,8 +911,45 @@ def test_a_switching_curve_along_nodes_where_both_signs_are_equally_good():
         inner = heights[np.abs(heights) < top / 2]
         np.testing.assert_allclose(inner, 0, atol=1e-6)
         seam = heights[np.abs(heights) >= top / 2]
-        assert bool(seam.size) == periodic
         np.testing.assert_allclose(np.abs(seam), top, atol=1e-6)
+        assert np.unique(np.sign(seam)).tolist() == [-1, 1] * periodic  # it is drawn at both ends
+
+
+def test_a_switching_curve_is_straight_where_the_control_is_off_by_a_cell():
+    """On a fine grid: the feedback switches up to 0.8 cells off x₂ = x₁ / 2, in waves of 12 cells."""
+    grid = Grid([-1.0, -1.0], [1.0, 1.0], (201, 201))
+
+    def feedback(x):
+        edge = x[..., :1] / 2 + 0.008 * np.sin(2 * np.pi * x[..., :1] / 0.12)
+        return np.where(x[..., 1:] > edge, -1.0, 1.0)
+
+    contour = plotting.switching_curve(made(grid, lambda x: x[..., 0], feedback), label=None)[0]
+    curve = contour.get_paths()[0].vertices
+    inner = curve[np.abs(curve[:, 0]) < 0.95]
+    assert len(inner) > 150
+    assert np.abs(inner[:, 1] - inner[:, 0] / 2).max() < 0.005  # half a cell
+
+
+@pytest.mark.parametrize("draw", ["value", "policy"])
+@pytest.mark.parametrize("top", [1.0, np.pi])
+def test_texts_are_apart_by_the_width_of_a_stroke(draw, top):
+    """Both axes and the colour bar have a tick at their ends, where labels are closest."""
+    grid = Grid([-1.0, -top], [1.0, top], (41, 40), periodic=(False, True), units=("", "rad" if top > 1 else ""))
+    name = Labels(value="V = E[(1 − e⁻ᵝᵀ)/β]")
+    solution = made(grid, lambda x: (x[..., 0] + 1) / 2, lambda x: np.sign(x[..., :1] + 0.01), labels=name)
+    figure = getattr(plotting, draw)(solution).figure
+    figure.set_dpi(100)
+    for (one, box), (other, second) in itertools.combinations(texts(figure), 2):
+        assert clearance(box, second) > 2, (one, other)
+
+
+def test_a_path_that_leaves_the_plane_is_called_a_projection():
+    solution = volume()
+    for last, name in ((0.0, "path"), (1.0, "path, projected")):
+        states = np.linspace([0.1, 0.1, 0.0], [0.9, 0.9, last], 5)
+        picture = plotting.closed_loop(solution, path_of(states, np.zeros((4, 3))))
+        plane = picture.figure.axes[0]
+        assert labels(plane) == [name, "start", "end"]
 
 
 def test_states_of_different_units_have_axes_of_their_own_and_so_has_the_mode():
@@ -886,13 +958,21 @@ def test_states_of_different_units_have_axes_of_their_own_and_so_has_the_mode():
     path = path_of(np.linspace([0.0, 0.1, 0.2], [1.0, 0.9, 0.5], 7), np.zeros((6, 2)))
     picture = plotting.closed_loop(solution, path)
     plane, *panels = [ax for ax in picture.figure.axes if ax.get_label() != "<colorbar>"]
-    assert labels(plane) == ["path", "start", "end"]
+    assert labels(plane) == ["path, projected", "start", "end"]
     assert [ax.get_ylabel() for ax in panels] == ["state", "angle\n[rad]", "control"]
     assert [labels(ax) for ax in panels] == [["x [m]", "y [m]"], [], ["u1", "u2"]]
     assert [ax.get_xlabel() for ax in panels] == ["", "", "t"]
     strokes = [drawn.get_linestyle() for drawn in panels[0].get_lines()]
     assert strokes == ["-", "--"]
     assert saved(picture)
+
+
+def test_a_picture_of_one_mode_names_it_once():
+    solution = two_modes(pushed=False)
+    ax = plotting.value(solution, fixed={"mode": 1}).ax
+    assert ax.get_title("right") == "mode poor"
+    plotting.policy(solution, fixed={"mode": 1}, ax=ax)
+    assert ax.get_title("right") == "mode poor"
 
 
 def test_the_mode_of_a_path_is_drawn_under_its_states():

@@ -47,3 +47,25 @@ def scale_label(mesh):
     (text,) = [text for text in mesh.colorbar.ax.texts if text.get_gid() == "label"]
     assert text.get_rotation() == 0
     return text.get_text().replace("\n", " ")
+
+
+def texts(figure):
+    """The texts that a figure shows and their boxes in points; tick labels outside of the axes are not shown."""
+    figure.canvas.draw()
+    shown = []
+    for ax in figure.axes:
+        for axis in (ax.xaxis, ax.yaxis):
+            lo, hi = sorted(axis.get_view_interval())
+            slack = 1e-9 * (hi - lo)
+            shown += [tick.label1 for tick in axis.get_major_ticks() if lo - slack <= tick.get_loc() <= hi + slack]
+            shown.append(axis.label)
+        shown += [ax.title, ax._left_title, ax._right_title, *ax.texts]
+        shown += ax.get_legend().get_texts() if ax.get_legend() else []
+    points = 72 / figure.dpi
+    boxes = [(text.get_text(), text.get_window_extent()) for text in shown if text.get_text() and text.get_visible()]
+    return [(text, np.array([[box.x0, box.y0], [box.x1, box.y1]]) * points) for text, box in boxes]
+
+
+def clearance(first, second):
+    """The distance of two boxes along the axis on which they are farther apart; negative if they overlap."""
+    return float(max(np.max(first[0] - second[1]), np.max(second[0] - first[1])))

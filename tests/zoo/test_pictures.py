@@ -126,6 +126,10 @@ def test_two_states_with_modes_have_one_panel_per_mode():
     figure = run_folder.plot_policies(problem, solution, {}, False)
     titles = [ax.get_title("right") for ax in figure.axes if ax.get_title("right")]
     assert titles == ["mode calm", "mode wild"] * 2
+    for mode in (1, "wild"):
+        assert plotting.value(solution, fixed={"mode": mode}).ax.get_title("right") == "mode wild"
+    path = simulate(problem, solution, [0.9, 0.5], 0.1, steps=2, mode="wild", key=0)
+    assert plotting.closed_loop(solution, path).figure.axes[0].get_title("right") == "mode wild"
     report = run_folder.json_report(solution, None, [])
     assert report["modes"] == ["calm", "wild"]
     assert report["shape"] == [2, 11, 11]

@@ -5,6 +5,7 @@ import pytest
 
 import hjbjax as hjb
 from hjbjax import zoo
+from hjbjax.cli import gallery
 
 
 @pytest.mark.slow
@@ -26,6 +27,17 @@ def test_without_a_rudder_the_boat_keeps_its_course(numbers):
     assert np.all(steers <= broken + 1e-5)
     across = [1.0, np.pi / 2]
     assert solution.value_at(across, mode="steers") < solution.value_at(across, mode="broken") - 0.02
+
+
+@pytest.mark.slow
+def test_at_the_tolerance_of_pictures_the_rudder_turns_towards_the_swimmer_at_every_node():
+    """By symmetry. With the default tolerance it is wrong next to the axes of symmetry, where V is nearly constant."""
+    problem, grid = zoo.pursuit(shape=gallery.drawn_shape((81, 80)))
+    solution = hjb.solve(problem, grid, tol=gallery.TOL)
+    lead, course = np.moveaxis(grid.nodes(), -1, 0)
+    turns = (np.abs(lead) > 0.25) & (np.abs(np.sin(course)) > 1e-6)  # on and against the course both ways are as good
+    rudder = solution.in_mode("steers").policy[..., 0]
+    np.testing.assert_array_equal(rudder[turns], -np.sign(lead * np.sin(course))[turns])
 
 
 def test_a_swimmer_faster_than_the_boat_is_refused():

@@ -66,14 +66,28 @@ def test_saving_is_the_answer_of_an_implicit_scheme(aversion, count):
     assert masses[0, 0] > 0.01  # poor households at the borrowing limit
 
 
+def dense_thermostat(temperatures, wear):
+    """The value and the choices of a dense program with walls at the ends."""
+    return dense_modes.solve(
+        [temperatures], 2, [0.0], lambda x, u, i: 0.2 * (5.0 - x) + 5.0 * i, lambda x, u, i: (x[0] - 20) ** 2 + i,
+        noise=lambda x, u, i: 1.0, switching=lambda x: np.array([[0, wear], [wear, 0]]), discount=0.1,
+    )  # fmt: skip
+
+
+def test_the_box_of_the_thermostat_has_no_walls():
+    """Up to its ends the value is that of a box twice as wide."""
+    problem, grid = hjb.zoo.thermostat(shape=(41,))
+    found = hjb.solve(problem, grid, scheme=hjb.Upwind(central=False), tol=1e-9)
+    wide, _ = dense_thermostat(np.linspace(0.0, 40.0, 81), wear=2.0)
+    assert np.max(np.abs(found.value - wide[:, 20:61])) < 0.05  # of a range of 89
+
+
 @pytest.mark.parametrize("wear", [0.3, 2.0])
 def test_the_thermostat_is_the_answer_of_a_dense_program(wear):
     problem, grid = hjb.zoo.thermostat(wear=wear, noise=1.0, shape=(41,))
+    grid = hjb.Grid(grid.lo, grid.hi, grid.shape)  # with walls, as in the dense program
     found = hjb.solve(problem, grid, scheme=hjb.Upwind(central=False), tol=1e-9)
-    exact, choices = dense_modes.solve(
-        [grid.axis(0)], 2, [0.0], lambda x, u, i: 0.2 * (5.0 - x) + 5.0 * i, lambda x, u, i: (x[0] - 20) ** 2 + i,
-        noise=lambda x, u, i: 1.0, switching=lambda x: np.array([[0, wear], [wear, 0]]), discount=0.1,
-    )  # fmt: skip
+    exact, choices = dense_thermostat(grid.axis(0), wear)
     assert np.max(np.abs(found.value - exact)) < 1e-8
     assert np.array_equal(found.switching, np.where(choices < 0, -1 - choices, [[0], [1]]))
     off, on = found.switching

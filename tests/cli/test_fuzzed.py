@@ -121,6 +121,7 @@ def stand_ins(monkeypatch):
     monkeypatch.setattr(run_folder, "difference", lambda *arguments: 0.0)
 
 
+@pytest.mark.slow
 def test_no_command_line_ends_in_a_traceback(stand_ins, tmp_path, monkeypatch):
     draw, seen = random.Random(0), set()
     for number in range(LINES):

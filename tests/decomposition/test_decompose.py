@@ -38,6 +38,7 @@ def test_decoupled_double_integrators_have_the_riccati_value():
     assert abs(path.cost - exact[0]) < 0.02
 
 
+@pytest.mark.slow
 def test_a_saved_solution_of_blocks_comes_back(tmp_path):
     problem = hjb.Problem(
         lambda x, u: u, lambda x, u: x @ x + u @ u, hjb.Box([-3.0] * 2, [3.0] * 2), discount=1.0,

@@ -38,7 +38,12 @@ def size(x):
         hjb.reach(lambda x, u, d: u + d, UNIT, size, disturbances=HALF),
         hjb.avoid(lambda x, u, d: u + d, HALF, size, disturbances=UNIT),
         hjb.reach(lambda x, u, d: u + d, UNIT, size, disturbances=HALF, tube=False),
-        hjb.reach(lambda x, u, d: u + d, hjb.Finite([[-1.0], [1.0]]), size, disturbances=hjb.Finite([[-0.5], [0.5]])),
+        pytest.param(
+            hjb.reach(
+                lambda x, u, d: u + d, hjb.Finite([[-1.0], [1.0]]), size, disturbances=hjb.Finite([[-0.5], [0.5]])
+            ),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["reach", "avoid", "set", "finite"],
 )

@@ -87,7 +87,7 @@ def test_the_values_of_random_games_are_enclosed(n, seeds):
         assert widths[1] < 0.6 * widths[0]
 
 
-@pytest.mark.parametrize("order", ["upper", "lower"])
+@pytest.mark.parametrize("order", ["upper", pytest.param("lower", marks=pytest.mark.slow)])
 def test_the_order_of_two_finite_sets_counts(order):
     """f = u d + b, L = q + 0.3 u d, u, d = ±1, |V'| < 0.3: H is q + b V' ± (V' + 0.3), + for min max."""
     whole, side = wave(np.random.default_rng(3), 1), 1 if order == "upper" else -1

@@ -34,7 +34,9 @@ def best_in_ball(sign, pieces, linear, square, radius, directions, curved):
 
 
 @pytest.mark.parametrize("curved", [False, True])
-@pytest.mark.parametrize(("dim", "kinks"), [(1, 1), (2, 1), (3, 1), (2, 3)])
+@pytest.mark.parametrize(
+    ("dim", "kinks"), [(2, 1), *(pytest.param(*each, marks=pytest.mark.slow) for each in [(1, 1), (3, 1), (2, 3)])]
+)
 @given(seed=SEEDS)
 @settings(max_examples=15)
 def test_a_ball_is_optimal_over_a_scan(dim, kinks, curved, seed):

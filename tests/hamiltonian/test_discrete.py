@@ -217,7 +217,7 @@ def table_of(problem, grid, value, controls, disturbances, scheme):
     return jax.lax.map(lambda u: jax.lax.map(lambda d: at(u, d), disturbances), controls)
 
 
-@pytest.mark.parametrize("count", [3, 130])
+@pytest.mark.parametrize("count", [3, pytest.param(130, marks=pytest.mark.slow)])
 @given(seed=SEEDS)
 @settings(max_examples=5)
 def test_a_finite_set_is_enumerated(count, seed):

@@ -64,6 +64,7 @@ def test_arrays_are_what_the_annotations_say():
     assert int(run.stdout) >= LEAST
 
 
+@pytest.mark.slow
 def test_a_wrong_annotation_would_be_found(tmp_path):
     package = tmp_path / "wrong"
     package.mkdir()

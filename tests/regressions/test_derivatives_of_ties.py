@@ -34,7 +34,7 @@ def marched(prices):
     return hjb.march(problem, GRID, 0.5, scheme=hjb.Upwind(), step=0.1).value_at(0.0, START, mode="expensive")
 
 
-@pytest.mark.parametrize("value", [solved, marched])
+@pytest.mark.parametrize("value", [solved, pytest.param(marched, marks=pytest.mark.slow)])
 def test_order_of_push_and_change_of_mode(value):
     with jax.enable_x64(True):
         program = jax.jit(jax.value_and_grad(value))

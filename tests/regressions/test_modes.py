@@ -504,7 +504,7 @@ def test_no_change_leads_to_a_mode_that_never_arrives():
     assert np.all(np.isinf(found.value[1]))
 
 
-@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("x64", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_large_value_is_compared_in_float64(x64):
     """V_a = 1000 + x and V_b = 1000: from x = 0 at speed 1 the controller pays 1 for the change at x = 1, and rests."""
     modes = hjb.Modes(("a", "b"), switching_cost=[[0.0, 1.0], [1.0, 0.0]])

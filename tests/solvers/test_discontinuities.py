@@ -112,7 +112,7 @@ def test_rest_next_to_a_jump():
 
 
 @pytest.mark.filterwarnings("ignore:the grid is coarse")
-@pytest.mark.parametrize("name", ["pendulum", "double_integrator"])
+@pytest.mark.parametrize("name", ["double_integrator", pytest.param("pendulum", marks=pytest.mark.slow)])
 def test_smooth_costs_need_no_linear_solve(name, monkeypatch):
     """Smooth data, kinks of V and targets are no jumps."""
 

@@ -263,7 +263,7 @@ def test_implicit_games_agree_with_explicit_ones():
     assert np.max(np.abs(step - explicit)[inner(grid)]) < 0.01  # of first order in Δt
 
 
-QUICK = [(hjb.Explicit(), False, "upper"), (hjb.Explicit(), True, "lower"), (hjb.Implicit(), False, "lower")]
+QUICK = [(hjb.Explicit(), False, "upper"), (hjb.Explicit(), True, "lower")]
 REST = [
     each
     for each in itertools.product((hjb.Explicit(), hjb.Implicit()), (False, True), ("upper", "lower"))

@@ -174,8 +174,8 @@ def test_a_coarse_march_warns():
         hjb.march(case.problem, line(-2.0, 2.0, 41, edges="open"), 1.0)
 
 
-@pytest.mark.parametrize("way", ["default", "upwind", "weno"])
-@pytest.mark.parametrize("edges", ["open", "linear"])
+@pytest.mark.parametrize("way", ["default", pytest.param("upwind", marks=pytest.mark.slow), "weno"])
+@pytest.mark.parametrize("edges", [pytest.param("open", marks=pytest.mark.slow), "linear"])
 def test_an_end_that_optimal_paths_leave_by_has_an_error(edges, way):
     """x' = u, |u| ≤ 1, and a terminal cost ψ that falls to the right: V = ψ(x + T − t), also beyond the end."""
     problem = hjb.Problem(lambda x, u: u, lambda x, u: 0.0, UNIT, terminal_cost=lambda x: 1 / (1 + jnp.exp(3 * x[0])))

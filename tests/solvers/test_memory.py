@@ -323,6 +323,7 @@ def test_the_estimate_is_near_what_the_compiler_reports(method):
     assert estimate >= peak / 2
 
 
+@pytest.mark.slow
 def test_numpy_takes_no_more_for_the_errors_of_a_march_than_is_told():
     drift, controls, ends = hjb.zoo.Dubins().drift, hjb.Box([-1.0], [1.0]), ([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi])
     tube = hjb.reach(drift, controls, lambda x: jnp.hypot(x[0], x[1]) - 0.5)

@@ -201,7 +201,7 @@ def assert_at_most_so_much_below(value, known, spacing_error):
     assert np.all(value.ravel() >= known - spacing_error)
 
 
-@pytest.mark.parametrize("grid", [LINE, GATHERED], ids=["uniform", "stretched"])
+@pytest.mark.parametrize("grid", [pytest.param(LINE, marks=pytest.mark.slow), GATHERED], ids=["uniform", "stretched"])
 @pytest.mark.parametrize("sigma", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 @pytest.mark.filterwarnings("error", "ignore:the box decides V")
 def test_one_input_against_the_oracle(grid, sigma):

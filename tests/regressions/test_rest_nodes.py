@@ -103,7 +103,7 @@ def fast(rate, x, u):
         (1e-13, 1.0, None),
         (1e9, 1e6, None),
         (1.0, 1e-6, None),
-        (1e9, 1e6, "float32"),
+        pytest.param(1e9, 1e6, "float32", marks=pytest.mark.slow),
     ],
 )
 def test_rest_is_told_by_like_beside_like(cost, rate, dtype):

@@ -64,7 +64,9 @@ def exported(case, folder):
 
 
 @pytest.mark.filterwarnings("ignore:Solution:UserWarning")  # states outside
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if "modes" in name else []) for name in CASES]
+)
 def test_the_answers_are_the_same(name, tmp_path):
     case, clamp = CASES[name]
     feedback = exported(case, tmp_path)

@@ -72,7 +72,7 @@ def test_jump_in_single_precision_and_in_a_batch():
         np.testing.assert_allclose(lane.grid_error, alone, rtol=0.05, atol=1e-3)
 
 
-@pytest.mark.parametrize("place", [0.05, 0.95])
+@pytest.mark.parametrize("place", [0.05, pytest.param(0.95, marks=pytest.mark.slow)])
 def test_jump_under_noise(place):
     """½ σ² V″ + V′ + L − β V = 0 with V(±1) = 0 and a jump of L."""
     grid, sigma = hjb.Grid([-1.0], [1.0], (81,)), 0.5

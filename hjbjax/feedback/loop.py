@@ -163,7 +163,19 @@ class Loop:
     def target(self, t: Number, x: State) -> jax.Array:
         """A function ≤ 0 in the target and where V stops the path; inf if there is neither."""
         level = self.number(jnp.inf if self.problem.target is None else self.problem.target, t, x)
-        return level if self.surplus is None else jnp.minimum(level, self.surplus(t, self.wrap(x)))
+        if self.surplus is None:
+            return level
+        # V knows ψ at the nodes only; between them stopping may still be forbidden
+        left = jnp.where(jnp.isfinite(self.price(t, x)), self.surplus(t, self.wrap(x)), jnp.inf)
+        return jnp.minimum(level, left)
+
+    def price(self, t: Number, x: State) -> jax.Array:
+        """The cost ψ of stopping at (t, x), or at a node that x meets up to rounding."""
+        return self.number(self.problem.stopping_cost, t, self.at_node(x))
+
+    def at_node(self, x: State) -> State:
+        """The state in the box, moved to a node of the grid that it meets up to rounding."""
+        return x if self.grid is None else self.grid.at_node(self.wrap(x))
 
     def until_change(self, t: Number, x: State) -> jax.Array:
         """A function ≤ 0 where the mode or the state changes suddenly; inf if neither does."""
@@ -194,7 +206,7 @@ class Loop:
         exit_cost = self.number(self.problem.exit_cost, t, x)
         if self.surplus is None:
             return exit_cost
-        price = self.number(self.problem.stopping_cost, t, x)
+        price = self.price(t, x)
         if self.problem.target is None:
             return price
         return jnp.where(self.number(self.problem.target, t, x) <= 0, exit_cost, price)

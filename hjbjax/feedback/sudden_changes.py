@@ -124,8 +124,8 @@ def after_choice(loop: Loop, t: Number, y: jax.Array, start: Number) -> jax.Arra
         return y
     x, problem = y[:-1], loop.problem
     surplus = loop.switch(t, loop.wrap(x))
+    costs = jnp.asarray(problem.switching_costs(*problem.state_arguments(loop.at_node(x), t)), x.dtype)
     number, due = 1 + jnp.argmin(surplus[1:]), surplus[0] <= 0
-    costs = jnp.asarray(problem.switching_costs(*problem.state_arguments(loop.wrap(x), t)), x.dtype)
     cost = y[-1] + jnp.where(due, loop.discount(jnp.asarray(t - start, x.dtype)) * costs[number - 1], 0)
     return jnp.append(jnp.where(due, _in_mode(loop, x, number), x), cost)
 

@@ -308,6 +308,24 @@ class Grid:
         cell = jnp.minimum(jnp.floor(jax.lax.stop_gradient(place)), last - 1).astype(int)
         return cell, place - cell, inside
 
+    def at_node(self, x: Array) -> jax.Array:
+        """The state (n,) with every entry within rounding of a node moved to the node, as in ``interpolate``.
+
+        A function that jumps at a node has the value of the node there.
+        """
+        x = jnp.asarray(x)
+        entries = [x[axis] for axis in range(self.ndim)]
+        for axis, entry in enumerate(entries):
+            if self.stretch[axis] is not None:  # there ``interpolate`` compares states with the nodes exactly
+                continue
+            nodes, width = jnp.asarray(self.axis(axis), x.dtype), jnp.asarray(self.spacing(axis), x.dtype)
+            index = jnp.clip(jnp.round((entry - nodes[0]) / width), 0, len(nodes) - 1).astype(int)
+            way = jax.lax.stop_gradient(nodes[index] - entry)
+            # twice the slack of ``interpolate``, whose positions are rounded differently
+            near = abs(way) <= 2 * self.slack(axis, x.dtype) * width
+            entries[axis] = entry + jnp.where(near, way, 0)
+        return jnp.stack(entries)
+
     def _locate_stretched(self, axis: int, x: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Node, fraction and flag on a stretched axis: the cell from φ⁻¹, the fraction from the nodes of the cell."""
         slack = 64 * jnp.finfo(x.dtype).eps  # relative to the whole axis, since ``place`` runs from 0 to 1

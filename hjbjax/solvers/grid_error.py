@@ -16,7 +16,8 @@ the time discretisation error. Only second differences are used, and an advected
 
 First differences fall like h where V is Lipschitz continuous, and not at all where V jumps. Near a jump the scheme
 smears V over a few cells and the error is up to the height of the jump. Comparing grids does not measure this, so the
-estimate there is at least the range of V over two coarse cells.
+estimate there is at least the range of V over two coarse cells. A march smears jumps over more and more cells, and
+first differences fall like the square root of h.
 """
 
 import dataclasses
@@ -41,6 +42,9 @@ SMEARED = (0.5, 1.0, 1.5, 1.75, STRAIGHT), (0.5, 1.0, 0.6, 0.67, 2.0)
 BENT = 0.1  # second differences below this fraction of the first differences do not determine the order
 # differences fall like h^a: a jump if a is below JUMP, none if a is above CONTINUOUS; √distance has a = 1/2
 JUMP, CONTINUOUS = 0.3, 0.6
+# In a march a scheme of order p smears a jump over a width h^(p/(p+1)), and differences there fall like h^(1/(p+1)). A
+# third of the range of V for p = 1 made the estimate a sixth of the error.
+SMEARED_JUMP, SMEARED_CONTINUOUS = 0.5, 0.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +59,7 @@ class TwoGrids:
       held: the fixed nodes, bool (*grid).
       chain: the value of the monotone chain on ``grid``, if V_h belongs to another scheme; else None.
       highest: the order of the scheme where V is smooth.
+      marched: True for values of marches, in which jumps move and are smeared.
     """
 
     grid: Grid
@@ -64,6 +69,7 @@ class TwoGrids:
     held: np.ndarray
     chain: np.ndarray | None = None
     highest: float = SECOND
+    marched: bool = False
 
 
 def estimate_error(answers: TwoGrids) -> np.ndarray:
@@ -86,8 +92,8 @@ def estimate_on_coarse(answers: TwoGrids) -> np.ndarray:
     bends = _order_of_bends(fine, rough, ratio)
     if answers.chain is None:
         for _ in range(REACH):  # the width of a smeared kink
-            near = _combined(bends, coarse, np.minimum)
-            change = np.where(near < STRAIGHT, _combined(change, coarse, np.maximum), change)
+            near = combined(bends, coarse, np.minimum)
+            change = np.where(near < STRAIGHT, combined(change, coarse, np.maximum), change)
         order = np.interp(bends, *SMEARED)
     else:
         gain = nested_grids.apart(
@@ -96,7 +102,8 @@ def estimate_on_coarse(answers: TwoGrids) -> np.ndarray:
         )
         order = np.minimum(bends, _order_of_slopes(change, gain, coarse))
     order = np.minimum(order, answers.highest)
-    return np.maximum(change / (ratio**order - 1), _jumps(fine, rough, ratio))
+    limits = (SMEARED_JUMP, SMEARED_CONTINUOUS) if answers.marched else (JUMP, CONTINUOUS)
+    return np.maximum(change / (ratio**order - 1), _jumps(fine, rough, ratio, limits))
 
 
 def is_a_point(target: np.ndarray) -> bool:
@@ -146,12 +153,12 @@ def _around(value: np.ndarray, grid: Grid) -> _Differences:
         below, above = (_part(steps, axis, k, count) for k in (0, 1))
         first = np.fmax(first, np.fmax(np.abs(below), np.abs(above)))
         second = np.fmax(second, np.abs(above - below))
-    return _Differences(_combined(first, grid, np.maximum), _combined(second, grid, np.maximum), np.zeros(grid.shape))
+    return _Differences(combined(first, grid, np.maximum), combined(second, grid, np.maximum), np.zeros(grid.shape))
 
 
 def _order_of_slopes(change: np.ndarray, gain: np.ndarray, coarse: Grid) -> np.ndarray:
     """The order from the ratio of ``change`` to ``gain``, averaged over neighbours, (*coarse)."""
-    change, gain = _combined(change, coarse, np.add), _combined(gain, coarse, np.add)
+    change, gain = combined(change, coarse, np.add), combined(gain, coarse, np.add)
     share = np.divide(change, gain, out=np.zeros_like(change), where=gain > 0)
     order = np.interp(np.log(np.maximum(share, SMOOTH)), np.log([SMOOTH, ALIKE]), [SECOND, FIRST])
     return np.where(share > ONE, SECOND, order)  # the schemes coincide, e.g. where noise permits central ones
@@ -163,10 +170,11 @@ def _order_of_bends(fine: _Differences, rough: _Differences, ratio: float) -> np
     return np.clip(np.where(counts, _exponent(fine.second, rough.second, ratio), SECOND), LEAST, SECOND)
 
 
-def _jumps(fine: _Differences, rough: _Differences, ratio: float) -> np.ndarray:
+def _jumps(fine: _Differences, rough: _Differences, ratio: float, limits: tuple[float, float]) -> np.ndarray:
     """The range of V over neighbouring cells where first differences indicate a jump, (*coarse)."""
     falls = _exponent(fine.first, rough.first, ratio)
-    return np.clip((CONTINUOUS - falls) / (CONTINUOUS - JUMP), 0, 1) * fine.extent
+    jump, continuous = limits
+    return np.clip((continuous - falls) / (continuous - jump), 0, 1) * fine.extent
 
 
 def _exponent(fine: np.ndarray, rough: np.ndarray, ratio: float) -> np.ndarray:
@@ -184,7 +192,7 @@ def _padded(values: np.ndarray, grid: Grid, axis: int, beyond: float | None, rea
     return np.pad(values, width, mode="edge") if beyond is None else np.pad(values, width, constant_values=beyond)
 
 
-def _combined(values: np.ndarray, grid: Grid, combine: Callable[[Any, Any], Any]) -> np.ndarray:
+def combined(values: np.ndarray, grid: Grid, combine: Callable[[Any, Any], Any]) -> np.ndarray:
     """Combine the values of every node and its neighbours."""
     for axis in grid.state_axes:
         wide = _padded(values, grid, axis, None)

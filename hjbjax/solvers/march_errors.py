@@ -5,13 +5,13 @@ The first coarse march has the caller's ends. Its difference from V is the discr
 ``box_error``.
 
 A step ends at every kept time, so it cannot be longer than the time between two of them. If there are only a few steps
-between kept times, the coarse marches keep every second time, and the estimate in between is the larger one of its two
-neighbours.
+between kept times, the coarse marches keep fewer times. In between, the estimate is the largest one of the nodes near
+by at the two neighbouring times.
 """
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from hjbjax.problem.types import Nodes, Number
 from hjbjax.solution.clock import Clock
 from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
-from hjbjax.solvers import box_error, grid_error, march_run, nested_grids, time_probes
+from hjbjax.solvers import box_error, grid_error, horizon_samples, march_run, nested_grids, time_probes
 from hjbjax.solvers.box_error import BoxError
 from hjbjax.solvers.coarser_answer import LOSES, OVER, TOO_FEW
 from hjbjax.solvers.grid_error import TwoGrids
@@ -34,7 +34,9 @@ from hjbjax.solvers.march_discontinuities import error_along_paths
 from hjbjax.solvers.result import warn_of_grid
 from hjbjax.solvers.setup import march_evaluation
 
-FEW = 4  # steps between two kept times, below which the coarse march keeps every second time
+# least number of steps between two kept times of the coarse march; the error of implicit steps is that of the time, and
+# three of them cannot be halved
+FEW, FEWEST = 4, 2
 UNSETTLED = "not estimated: the march on the coarser grid did not come to its end"
 ONE_STEP = "not estimated: the march took one step, and a coarser one cannot take fewer"
 
@@ -97,15 +99,16 @@ def with_march_errors(solution: Solution, marched: Marched, clock: Clock) -> Sol
     held, points = _held(task, np.asarray(solution.times))
     coarse = _coarser(marched, np.asarray(solution.times), held)
     first = None if coarse.on is None else _again(marched, coarse, coarse.on, solution, clock)
-    solution = _with_grid_error(solution, marched, coarse, (first, held, points))
+    other = None if first is None or coarse.reason else _from_other_samples(marched, coarse, solution, clock)
+    solution = _with_grid_error(solution, marched, coarse, (first, other, held, points))
     return box_error.reported(solution, _box_error(solution, marched, coarse, first, clock))
 
 
 def _with_grid_error(
-    solution: Solution, marched: Marched, coarse: _Coarse, found: tuple[np.ndarray | None, np.ndarray, bool]
+    solution: Solution, marched: Marched, coarse: _Coarse, found: tuple[Any, Any, np.ndarray, bool]
 ) -> Solution:
     """The solution with an estimate of the discretisation error in space and time, from V on the coarser grid."""
-    first, held, points = found
+    first, other, held, points = found
     if coarse.reason or first is None or coarse.on is None:
         solution.stats["grid_error"] = coarse.reason or UNSETTLED
         return solution
@@ -114,15 +117,21 @@ def _with_grid_error(
     errors = np.zeros_like(value)
     for i, before in zip(coarse.kept, first, strict=True):
         if solution.times[i] < horizon:  # V is prescribed at the horizon
-            answers = TwoGrids(grid, coarse.on.grid, value[i], before, held[i % len(held)], highest=highest)
+            fixed = held[i % len(held)]
+            answers = TwoGrids(grid, coarse.on.grid, value[i], before, fixed, highest=highest, marched=True)
             errors[i] = grid_error.estimate_error(answers)
     missed = error_along_paths(solution, marched.task, marched.start, held)
     if missed is not None:
         errors = np.maximum(errors, missed.astype(errors.dtype))
+    if other is not None:
+        ratio = nested_grids.ratio_of(grid, coarse.on.grid)
+        for i, before, changed in zip(coarse.kept, first, other, strict=True):
+            hidden = nested_grids.prolong(np.abs(changed - before) / ratio, coarse.on.grid, grid)
+            errors[i] = np.maximum(errors[i], hidden)
     warn_of_grid(errors, value, "nodes and steps")
     for i in np.flatnonzero(solution.times < horizon):
         errors[i] += _left(marched, value[i])
-    return dataclasses.replace(solution, grid_error=_at_all_times(errors, coarse.kept))
+    return dataclasses.replace(solution, grid_error=_at_all_times(errors, coarse.kept, solution, marched))
 
 
 def _box_error(
@@ -147,7 +156,7 @@ def _box_error(
         return found
     errors = np.zeros((len(solution.times), *task.grid.shape), found.error.dtype)
     errors[coarse.kept] = found.error
-    return found._replace(error=_at_all_times(errors, coarse.kept))
+    return found._replace(error=_at_all_times(errors, coarse.kept, solution, marched))
 
 
 def _held(task: March, times: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -174,7 +183,7 @@ def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
         reason = ONE_STEP
     else:
         on = task.on.on_grid(coarse)
-        kept = _every_second(times, float(task.horizon), marched.steps)
+        kept = _far_apart(times, float(task.horizon), (FEWEST if task.method.limited else FEW) / marched.steps)
         return _Coarse(on, _longer(marched, times[kept]), kept)
     if others == grid.edges:
         return _Coarse(None, 1.0, everything, reason)
@@ -184,14 +193,15 @@ def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
     return _Coarse(task.on.chain.on_grid(smaller), 1.0, everything, reason)
 
 
-def _every_second(times: np.ndarray, horizon: float, steps: int) -> np.ndarray:
-    """The indices of the kept times of the coarse march: all, or every second one starting with the first."""
-    count = len(times)
-    lengths = np.diff([*times, horizon])
-    lengths = lengths[lengths > 0]
-    if count < 2 or not lengths.size or np.min(lengths) * steps >= FEW * (horizon - times[0]):
-        return np.arange(count)
-    return np.unique([*range(0, count, 2), *((count - 1,) if times[-1] >= horizon else ())])
+def _far_apart(times: np.ndarray, horizon: float, share: float) -> np.ndarray:
+    """The indices of the kept times of the coarse march: the first, and others at least a share of the march apart."""
+    least = min(share, 0.5) * (horizon - times[0]) * (1 - 1e-6)
+    chosen = [0]
+    for k in range(1, len(times)):
+        ends = times[k] >= horizon
+        if ends or (times[k] - times[chosen[-1]] >= least and horizon - times[k] >= least):
+            chosen.append(k)
+    return np.array(chosen)
 
 
 def _longer(marched: Marched, times: np.ndarray) -> float:
@@ -202,13 +212,33 @@ def _longer(marched: Marched, times: np.ndarray) -> float:
     return 3.0 if few and not marched.task.method.limited else 2.0
 
 
+def _from_other_samples(marched: Marched, coarse: _Coarse, solution: Solution, clock: Clock) -> np.ndarray | None:
+    """The coarse march from other values near the jumps and kinks at the horizon; None if there are none."""
+    task, on = marched.task, coarse.on
+    if on is None or clock.over() is not None:
+        return None
+    value, start = np.asarray(solution.value), marched.start
+    start = None if start is None else np.asarray(start)
+    begin = horizon_samples.other_samples(task.on.at(task.horizon), start, on.grid, float(np.ptp(value)))
+    return None if begin is None else _again(marched, coarse, on, solution, clock, begin)
+
+
 def _again(
-    marched: Marched, coarse: _Coarse, on: Discretisation, solution: Solution, clock: Clock
+    marched: Marched,
+    coarse: _Coarse,
+    on: Discretisation,
+    solution: Solution,
+    clock: Clock,
+    begin: np.ndarray | None = None,
 ) -> np.ndarray | None:
-    """V at the times that are kept again, by a march on a coarser grid; None if it does not finish."""
+    """V at the times that are kept again, by a march on a coarser grid; None if it does not finish.
+
+    ``begin``: V at the horizon on this grid; by default the caller's.
+    """
     task, on = marched.task, cast(on, on.dtype)
     start = marched.start
-    begin = None if start is None else nested_grids.restrict(np.asarray(start), task.grid, on.grid)
+    if begin is None and start is not None:
+        begin = nested_grids.restrict(np.asarray(start), task.grid, on.grid)
     method = marched.method.filled(on, march_evaluation(on.problem, on.grid))
     longer = coarse.longer > 1
     again = dataclasses.replace(
@@ -266,8 +296,16 @@ def _left(marched: Marched, value: np.ndarray) -> float:
     return missed + (TOL * min(1.0, float(np.ptp(value))) if tol is None else float(tol))
 
 
-def _at_all_times(errors: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Errors at all kept times, (k, *grid): the larger of both neighbours where they are not ``known``."""
+def _at_all_times(errors: np.ndarray, known: np.ndarray, solution: Solution, marched: Marched) -> np.ndarray:
+    """Errors at all kept times, (k, *grid), from those at the ``known`` ones.
+
+    The error at a time in between is at most the largest at both neighbours near a node: it moves by one cell per step.
+    """
+    times, per_time = solution.times, marched.steps / (float(marched.task.horizon) - float(solution.times[0]))
     for i in np.setdiff1d(np.arange(len(errors)), known):
-        errors[i] = np.max(errors[[j for j in (i - 1, i + 1) if j in known]], axis=0)
+        near = [k for k in (known[known < i][-1:], known[known > i][:1]) if k.size]
+        found = np.max([errors[int(k[0])] for k in near], axis=0)
+        for _ in range(math.ceil(max(abs(times[int(k[0])] - times[i]) for k in near) * per_time)):
+            found = grid_error.combined(found, solution.grid, np.maximum)
+        errors[i] = found
     return errors

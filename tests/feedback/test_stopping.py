@@ -69,3 +69,52 @@ def test_noisy_paths_stop_and_cost_what_v_promises_in_the_mean():
     cost = np.asarray(paths.cost)
     mean, deviation = cost.mean(), cost.std() / np.sqrt(len(cost))
     assert abs(mean - float(solution.value_at([0.55]))) < 4 * deviation < 0.04
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("forbidden", [np.inf, 5.0])
+@pytest.mark.parametrize("place", [0.5, 0.51])
+@pytest.mark.parametrize("start", [0.0, 0.47, 0.49])
+def test_a_path_stops_on_the_allowed_side_of_a_jump(forbidden, place, start):
+    """x' = 1: stop at the first node where it is cheap. The path met the node up to rounding and paid infinity."""
+    problem = hjb.Problem(
+        lambda x, u: 1 + 0 * u, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), discount=0.5,
+        stopping_cost=lambda x: jnp.where(x[0] < place, forbidden, 0.3),
+    )  # fmt: skip
+    grid = hjb.Grid([-1.0], [1.0], (41,))
+    path = hjb.simulate(problem, hjb.solve(problem, grid), [start], 3.0)
+    node = 0.5 if place == 0.5 else 0.55
+    decay = np.exp(-0.5 * (node - start))
+    assert path.status.name == "TARGET"
+    assert path.cost == pytest.approx((1 - decay) / 0.5 + 0.3 * decay, rel=1e-8)
+
+
+@pytest.mark.slow
+def test_no_path_stops_inside_a_forbidden_strip_between_nodes():
+    """ψ = ∞ on (0.51, 0.54), between nodes at which stopping is optimal."""
+    problem = hjb.Problem(
+        lambda x, u: 1 + 0 * u, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), discount=0.5,
+        stopping_cost=lambda x: jnp.where(jnp.abs(x[0] - 0.525) < 0.015, jnp.inf, 0.3),
+    )  # fmt: skip
+    path = hjb.simulate(problem, hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,))), [0.52], 3.0)
+    decay = np.exp(-0.5 * 0.02)
+    assert path.states[-1, 0] == pytest.approx(0.54, abs=1e-6)
+    assert path.cost == pytest.approx((1 - decay) / 0.5 + 0.3 * decay, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_mode_is_not_changed_where_that_costs_infinity():
+    """x' = 1: a change from mode a, with cost 2, to mode b, without cost, is allowed from x = 0.5 on."""
+
+    def price(x):
+        return jnp.array([[0.0, jnp.inf], [jnp.inf, 0.0]]).at[0, 1].set(jnp.where(x[0] < 0.5, jnp.inf, 0.1))
+
+    problem = hjb.Problem(
+        lambda x, u, mode: 1 + 0 * u, lambda x, u, mode: jnp.where(mode == 0, 2.0, 0.0), hjb.Box([-1.0], [1.0]),
+        discount=0.5, modes=hjb.Modes(("a", "b"), switching_cost=price),
+    )  # fmt: skip
+    solution = hjb.solve(problem, hjb.Grid([-1.0], [1.0], (41,)))
+    for start in (0.0, 0.47):
+        path = hjb.simulate(problem, solution, [start], 10.0, mode="a", clamp=True)
+        decay = np.exp(-0.5 * (0.5 - start))
+        assert path.cost == pytest.approx((1 - decay) / 0.25 + 0.1 * decay, rel=1e-8)

@@ -482,7 +482,7 @@ def _march_traced(
     )  # fmt: skip
     value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
     touching: list[dict[str, Any]] = []
-    unmoved = on.asking(_without_moving_target(problem))
+    unmoved = on.asking(_without_moving_target(on.problem))  # with the numbers of the cast above
     fine = _is_stable(on, method, horizon, step) & ~node_checks.state_fails(jax.lax.stop_gradient(unmoved))
     for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
         # without 1e-6 rounding could add a step to a whole number of steps; none if a kept time is the horizon

@@ -375,7 +375,7 @@ def _trace_with_numbers_as_leaves(
             if found[1] is None or jaxprs.calls_back(found[1].jaxpr):  # a host function cannot read a traced number
                 break
             first = len(jax.tree.leaves(function.keywords))
-            stuck = decisive(found[1].jaxpr, found[1].jaxpr.invars[first : first + len(read)])
+            stuck = decisive(found[1].jaxpr, found[1].jaxpr.invars[first : first + len(read)], list(read.values()))
             if not stuck:
                 return found
             read = {name: number for at, (name, number) in enumerate(read.items()) if at not in stuck}

@@ -7,8 +7,8 @@ each new one would cost seconds of compilation.
 ``for mass in masses: solve(Problem(lambda x, u: u / mass, ...), grid)`` would still compile a program for every mass,
 because a number that a function closes over is part of its computation. The numbers in cells and globals are therefore
 found and passed to a copy of the function as arguments, so they become leaves of the problem. A number stays in the
-function if it is used for more than arithmetic: an exponent determines how a cost depends on the control, an integer
-may be a shape, a comparison with another number may choose between two branches.
+function if it is used for more than arithmetic: an exponent of 2 makes a cost quadratic in the control, an integer may
+be a shape, a comparison with another number may choose between two branches.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "j
 # operations with a number that do not change the kind of dependence on a state or a control
 ARITHMETIC = frozenset(
     {"add", "add_any", "sub", "mul", "div", "max", "min", "clamp", "atan2", "dot_general", "concatenate"}
-    | {"gt", "ge", "lt", "le", "select_n"}
+    | {"gt", "ge", "lt", "le"}
 )
 CALLED = frozenset({"jit", "pjit"})  # the same primitive in different versions of JAX
 INSIDE = "."  # between the name of a function and the name that it reads
@@ -413,34 +413,44 @@ def _is_number(thing: object, kinds: tuple[type, ...]) -> bool:
     return isinstance(thing, kinds) and not isinstance(thing, bool)
 
 
-def decisive(jaxpr: jex.Jaxpr, variables: Sequence[jex.Var]) -> set[int]:
-    """Positions of the variables that are used for more than arithmetic with the jaxpr's other arguments."""
+def decisive(jaxpr: jex.Jaxpr, variables: Sequence[jex.Var], values: Sequence[np.ndarray]) -> set[int]:
+    """Positions of the variables that are used for more than arithmetic with the jaxpr's other arguments.
+
+    An exponent is decisive if its value is an integer: in Python code it may be one, for which JAX multiplies.
+    """
+    whole = frozenset(at for at, value in enumerate(values) if np.all(value == np.round(value)))
     owners = {var: frozenset([position]) for position, var in enumerate(variables)}
-    return set(_follow(jaxpr, owners)[0])
+    return set(_follow(jaxpr, owners, whole)[0])
 
 
-def _follow(jaxpr: jex.Jaxpr, owners: dict[jex.Var, frozenset[int]]) -> tuple[set[int], list[frozenset[int]]]:
+def _follow(
+    jaxpr: jex.Jaxpr, owners: dict[jex.Var, frozenset[int]], whole: frozenset[int]
+) -> tuple[set[int], list[frozenset[int]]]:
     """Positions of the decisive variables, and for each output the positions of the variables it depends on.
 
     ``owners``: for each variable that is known before any state, the positions it was made from.
     """
+
+    def sources(var: jex.Var | jex.Literal) -> frozenset[int]:
+        return frozenset() if jaxprs.is_literal(var) else owners.get(cast("jex.Var", var), frozenset())
+
     deciding: set[int] = set()
     for eqn in jaxpr.eqns:
-        read = [owners.get(cast("jex.Var", each), frozenset()) for each in eqn.invars if not jaxprs.is_literal(each)]
+        read = [sources(each) for each in eqn.invars]
         touched: frozenset[int] = frozenset().union(*read)
-        if touched and all(read):  # a number made from numbers
-            owners |= dict.fromkeys(eqn.outvars, touched)
+        if touched and all(each or jaxprs.is_literal(var) for each, var in zip(read, eqn.invars, strict=True)):
+            owners |= dict.fromkeys(eqn.outvars, touched)  # a number made from numbers
             continue
-        inner = eqn.params.get("jaxpr")
-        if touched and eqn.primitive.name in CALLED and jaxprs.is_closed(inner):
-            known = zip(inner.jaxpr.invars, eqn.invars, strict=True)
-            pairs = {mine: owners[its] for mine, its in known if not jaxprs.is_literal(its) and its in owners}
-            inside, results = _follow(inner.jaxpr, pairs)
+        name, inner = eqn.primitive.name, eqn.params.get("jaxpr")
+        if touched and name in CALLED and jaxprs.is_closed(inner):
+            pairs = {mine: each for mine, each in zip(inner.jaxpr.invars, read, strict=True) if each}
+            inside, results = _follow(inner.jaxpr, pairs, whole)
             deciding |= inside
             owners |= {var: each for var, each in zip(eqn.outvars, results, strict=True) if each}
-        elif touched and eqn.primitive.name not in ARITHMETIC:
+        elif name == "select_n":
+            deciding |= read[0]  # numbers that choose between two functions of the state
+        elif name == "pow":
+            deciding |= read[1] & whole
+        elif touched and name not in ARITHMETIC:
             deciding |= touched
-        elif eqn.primitive.name == "select_n":
-            deciding |= frozenset().union(*read[:1])  # numbers that choose between two functions of the state
-    ends = [owners.get(cast("jex.Var", each), frozenset()) for each in jaxpr.outvars]  # literals have no owners
-    return deciding, ends
+    return deciding, [sources(each) for each in jaxpr.outvars]

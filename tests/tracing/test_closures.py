@@ -255,6 +255,23 @@ def test_thresholds_and_tuples_are_numbers():
     assert len(marks) == 1
 
 
+def test_broken_exponents_are_numbers():
+    """A sweep over the exponents of a model of growth shares a program; an integer may make a cost quadratic."""
+
+    def ask(share, aversion):
+        cost = lambda x, u: -(u[0] ** (1 - aversion)) / (1 - aversion) + x[0] ** share  # noqa: E731
+        return closures.settled(hjb.Problem(steer, cost, UNIT), 1).cost
+
+    x, u, marks = np.array([0.7]), np.array([0.3]), []
+    for share, aversion in ((0.3, 1.5), (0.4, 2.5), (0.4, 2.0), (2.0, 1.5)):
+        found = ask(share, aversion)
+        marks.append(found.func.mark)
+        wanted = 0.7**share - 0.3 ** (1 - aversion) / (1 - aversion)
+        assert jax.jit(found)(x, u) == pytest.approx(wanted, rel=1e-6)
+    assert marks[0] == marks[1]
+    assert len(set(marks)) == 3
+
+
 def test_a_tuple_of_a_shape_stays_in_the_code():
     def ask(shape, gain):
         return closures.settled(hjb.Problem(lambda x, u: gain[0] * u + jnp.zeros(shape), square, UNIT), 1).drift

@@ -258,8 +258,8 @@ def _exit_at_nodes(problem: Problem, grid: Grid) -> tuple[np.ndarray, np.ndarray
         if np.any(np.isnan(values)):
             state = grid.nodes()[np.unravel_index(int(np.argmax(np.isnan(values))), grid.shape)]
             raise ValueError(
-                f"enclose: {name}(x) is NaN at x = {np.round(state, 4).tolist()}; wanted a number at every state of the\n"
-                "box. Guard square roots, logarithms and quotients with jnp.maximum or jnp.where"
+                f"enclose: {name}(x) is NaN at x = {np.round(state, 4).tolist()}; wanted a number at every state of\n"
+                "the box. Guard square roots, logarithms and quotients with jnp.maximum or jnp.where"
             )
         found.append(values)
     return found[0], found[1]

@@ -142,6 +142,18 @@ def test_a_list_of_cells_has_the_defects_of_all_cells(controls):
 
 
 @pytest.mark.slow
+def test_a_value_in_three_dimensions_is_enclosed_and_the_bounds_close_with_the_mesh():
+    value = lambda x: 0.3 * jnp.sum(jnp.cos(2 * jnp.pi * x)) + 0.2 * jnp.sin(2 * jnp.pi * (x[0] + x[1]))  # noqa: E731
+    drift = lambda x, u: 0.2 * jnp.sin(2 * jnp.pi * x[jnp.array([1, 2, 0])]) + u  # noqa: E731
+    problem, widths = manufactured(value, drift, in_box(2.0), hjb.Box([-2.0] * 3, [2.0] * 3)), []
+    for count in (12, 24):
+        grid = hjb.Grid([0.0] * 3, [1.0] * 3, (count,) * 3, periodic=(True,) * 3)
+        found = hjb.enclose(problem, near(grid, value), rounds=1)
+        widths.append(check(found, value, [0.0] * 3, [1.0] * 3))
+    assert widths[1] < 0.5 * widths[0]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2])
 def test_the_values_of_many_random_problems_are_enclosed(n):
     for seed in range(40 if n == 1 else 5):

@@ -28,9 +28,9 @@ HELPS = 0.6  # other candidates are tried if a correction leaves more than this 
 SMOOTHER = 3  # the largest number of times that a candidate is smoothed
 STAGNANT = 2  # stop after this number of corrections without progress
 BISECTIONS = 2  # largest number of bisections of a cell
-PASSES = 3  # times that the cells with the largest defects are bisected once more
+PASSES = 3  # times that the cells with the largest defects are bisected once more after the last correction
 LARGEST = 0.5  # cells with at least this fraction of the largest defect are bisected
-SHARE = 0.03  # largest fraction of the cells that are bisected at a time: their halves take as long as an eighth of all
+SHARE = 0.03  # largest fraction of the cells that are bisected at a time: their parts take as long as half of all cells
 WORTH = 0.97  # bisect only if the other cells require less than this fraction of the shift
 GAIN = 0.97  # progress means that less than this fraction of the width is left
 Kept: TypeAlias = list[tuple[np.ndarray, float]]  # the candidates of a bound, and their shifts
@@ -220,7 +220,9 @@ class DiscountTask:
     def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
         """The defects after the cells that determine the shift, at most a fraction ``SHARE``, are cut into parts."""
         cuts = np.zeros(self.spline.shape, int)
-        for _ in range(PASSES):
+        # without a further correction only the largest defect counts, which fewer parts reduce
+        is_last = bool(np.max(sizes_of(found, lead, sign)) <= self.wanted / 4)
+        for turn in range(PASSES if is_last else BISECTIONS):
             sizes = sizes_of(found, lead, sign)
             if not np.all(np.isfinite(sizes)):
                 break
@@ -232,11 +234,11 @@ class DiscountTask:
             chosen &= found.high - found.low > 0.2 * np.abs(sizes)
             if not np.any(chosen):
                 break
-            for cut in np.unique(cuts[chosen]):
-                index = np.nonzero(chosen & (cuts == cut))
-                parts = defect.blocks(self.problem, self.grid, self.spline, index, int(cut) + 1)
+            cuts[chosen] = cuts[chosen] + 1 if is_last else turn + 1
+            for depth in np.unique(cuts[chosen]):
+                index = np.nonzero(chosen & (cuts == depth))
+                parts = defect.blocks(self.problem, self.grid, self.spline, index, int(depth))
                 found = defect.defects(self.spline, parts, values, found)
-            cuts[chosen] += 1
         return found
 
 

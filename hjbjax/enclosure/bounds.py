@@ -1,7 +1,7 @@
 """The bounds as functions, and ``Enclosure``, the result of ``enclose``, with its files."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -83,6 +83,17 @@ def evaluate_in_box(
     return found.reshape(states.shape[:-1])
 
 
+def spline_arrays(spline: Spline) -> dict[str, np.ndarray]:
+    """The arrays of a file from which ``spline_of`` makes the same spline."""
+    # a proof holds for these very numbers, which another machine may compute differently
+    return {f"axis{axis}": table.at for axis, table in enumerate(spline.tables)}
+
+
+def spline_of(arrays: Mapping[str, np.ndarray], periodic: Sequence[bool]) -> Spline:
+    """The spline with the arrays of a file."""
+    return Spline(tuple(axis_table(arrays[f"axis{k}"], cyclic) for k, cyclic in enumerate(periodic)))
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Enclosure(files.Saved):
     """Two functions between which the value of the continuous problem lies; made by ``enclose``.
@@ -150,8 +161,7 @@ class Enclosure(files.Saved):
         }  # fmt: skip
         names = ("lower", "upper", "remaining", "required")
         arrays = {"lo": self.grid.lo, "hi": self.grid.hi, **{name: getattr(self, name) for name in names}}
-        # the bounds are proved for these very numbers, which another machine may compute differently
-        arrays |= {f"axis{axis}": table.at for axis, table in enumerate(self.bounds[0].spline.tables)}
+        arrays |= spline_arrays(self.bounds[0].spline)
         for name, bound in zip(SIDES, self.bounds, strict=True):
             arrays[f"{name}_coefficients"] = np.stack(bound.coefficients)
             parts = [(each.edges, each.values, each.slopes) for each in bound.levels]
@@ -177,7 +187,7 @@ class Enclosure(files.Saved):
     def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
         """The enclosure with a header and arrays of a file."""
         grid = archive.grid_of(header["grid"], arrays["lo"], arrays["hi"])
-        spline = Spline(tuple(axis_table(arrays[f"axis{k}"], cyclic) for k, cyclic in enumerate(grid.periodic)))
+        spline = spline_of(arrays, grid.periodic)
         lower, upper = (
             Bound(
                 spline, tuple(arrays[f"{name}_coefficients"]),

@@ -9,33 +9,35 @@ in cells where it is the best one somewhere.
 Each candidate is corrected along the paths of its control, since they leave the kink to one side.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
 from hjbjax.enclosure import correction
 from hjbjax.enclosure.bounds import Bound
-from hjbjax.enclosure.defect import Defects
-from hjbjax.enclosure.discounted import DiscountTask, Kept, Move, sizes_of
+from hjbjax.enclosure.defect import Index
+from hjbjax.enclosure.discounted import DiscountTask, Kept, Move, Start, sizes_of
 from hjbjax.enclosure.levels import Levels
 from hjbjax.problem.grid import Grid
+from hjbjax.tracing.intervals import point
 
 FAR = 0.1  # more candidates are tried if a bound is off by this fraction of the range of V somewhere ...
 MORE = 3  # ... with this many times as many corrections
 STEP = 8  # cells; the mean and the spline smooth a kink over about seven
 RISE = 0.5  # a candidate loses this fraction of the range of V where it reads beyond an end
 LEVEL = 3.0  # the level of a correction is the shift divided by this number
+AHEAD = 0.7  # defects count above this fraction of the level of the last correction: the next level is lower
 STAGNANT = 5  # stop after this number of corrections without progress ...
 FALLS = 0.9  # ... unless the largest defect fell by this factor
 PROGRESS = 0.1  # least gain of a correction, relative to the wanted width or to a tenth of the shift
 REFRESHED = 4  # corrections that share one factorisation
 
 
-def bound(
-    task: DiscountTask, values: np.ndarray, found: Defects, move: Move, sign: int, rounds: int
-) -> tuple[Bound, np.ndarray]:
+def bound(task: DiscountTask, start: Start, move: Move, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
     """The bound of ``DiscountTask.bound``, with more candidates if it is far from V."""
-    narrow, sizes = task.bound(values, found, move, sign, rounds)
+    narrow, sizes = task.bound(start, move, sign, rounds)
+    values, _ = start(0)
     shifts = [-sign * float(each.values[0]) for each in narrow.levels]
     kept = list(zip(narrow.coefficients, shifts, strict=True))
 
@@ -91,27 +93,28 @@ def further(task: DiscountTask, candidates: Sequence[np.ndarray], kept: Kept, si
     """
     added: Kept = []
     moves: list[Move] = []
-    best, worst, stagnant = _best(kept, sign), np.inf, 0
+    leaders, level = Leaders.of(kept, sign), 0.0
+    worst, stagnant = np.inf, 0
     for turn in range(rounds if candidates else 0):
-        found = [task.defects(each) for each in candidates]
-        needs = required(task, candidates, found, sign)
-        largest = float(np.max(needs))
-        leads = [task.lead(each, [*kept, *added], sign) for each in candidates]
-        sizes = np.minimum(needs, leads)
+        is_open = [~is_beaten(task, candidates, i, sign) for i in range(len(candidates))]
+        leads = [leaders.leads(task, each, some) for each, some in zip(candidates, is_open, strict=True)]
+        if turn % REFRESHED == 0:
+            moves = [task.mover(task.policy(each)) for each in candidates]
+        sizes, largest = required(task, candidates, leads, sign, level)
+        sizes = leaders.narrowed(task, candidates, sizes)
         shift = float(np.max(sizes))
         if not np.isfinite(shift):
             break
         fresh = [(each, shift) for each in candidates]
-        better = np.maximum(best, _best(fresh, sign))
+        better = leaders.with_candidates(fresh)
         stagnant = 0 if largest < FALLS * worst else stagnant + 1
         worst = min(worst, largest)
-        if np.mean((better - best)[task.chosen]) > PROGRESS * max(task.wanted, shift / 10):
-            best, stagnant = better, 0
+        if np.mean((better.values - leaders.values)[task.chosen]) > PROGRESS * max(task.wanted, shift / 10):
+            leaders, stagnant = better, 0
             added += fresh
         if shift <= task.wanted / 4 or stagnant >= STAGNANT:
             break
-        if turn % REFRESHED == 0:
-            moves = [task.mover(each) for each in found]
+        level = AHEAD * shift / LEVEL
         excess = [correction.on_nodes(np.maximum(each - shift / LEVEL, 0), task.grid) for each in sizes]
         candidates = [
             each - sign * move(correction.smooth_cover(source, task.grid)) if np.any(source) else each
@@ -120,17 +123,92 @@ def further(task: DiscountTask, candidates: Sequence[np.ndarray], kept: Kept, si
     return added
 
 
-def required(
-    task: DiscountTask, candidates: Sequence[np.ndarray], found: Sequence[Defects], sign: int
-) -> list[np.ndarray]:
-    """The shift that every cell requires of every candidate, if all have the same shift, shape (*cells) each.
+@dataclasses.dataclass(frozen=True)
+class Leaders:
+    """The best of several candidates at every node.
 
-    In a cell in which another candidate is better everywhere, nothing is required.
+    Attributes:
+      kept: the candidates and their shifts.
+      sign: 1 for a lower and −1 for an upper bound.
+      values: the bound at the nodes, with its sign changed for an upper bound, shape (*grid).
+      which: the number of the best candidate, (*grid).
     """
-    needs = []
-    for i, (each, defects) in enumerate(zip(candidates, found, strict=True)):
-        need = sizes_of(defects, np.inf, sign)
-        for other in (*candidates[:i], *candidates[i + 1 :]):
-            need = np.where(task.spline.largest(sign * (each - other)) < 0, 0, need)
-        needs.append(need)
-    return needs
+
+    kept: Kept
+    sign: int
+    values: np.ndarray
+    which: np.ndarray
+
+    @classmethod
+    def of(cls, kept: Kept, sign: int) -> "Leaders":
+        """The best of some candidates."""
+        shape = kept[0][0].shape
+        return cls([], sign, np.full(shape, -np.inf), np.zeros(shape, int)).with_candidates(kept)
+
+    def with_candidates(self, more: Kept) -> "Leaders":
+        """The best of these and of some more candidates."""
+        values, which = self.values, self.which
+        for k, (each, shift) in enumerate(more, len(self.kept)):
+            own = self.sign * each - shift
+            values, which = np.maximum(values, own), np.where(own > values, k, which)
+        return Leaders([*self.kept, *more], self.sign, values, which)
+
+    def leads(self, task: DiscountTask, values: np.ndarray, some: np.ndarray) -> np.ndarray:
+        """The shift with which a candidate is not better in a cell than the best one at its node; zero in other cells.
+
+        Args:
+          task: the data of the bounds.
+          values: the candidate, (*grid).
+          some: True for the cells, (*cells).
+        """
+        found, index = np.zeros(some.shape), np.nonzero(some)
+        which = self.which[tuple(i % count for i, count in zip(index, values.shape, strict=True))]
+        for k in np.nonzero(np.bincount(which, minlength=1))[0]:
+            own = tuple(i[which == k] for i in index)
+            found[own] = self.lead(task, values, int(k), own)
+        return found
+
+    def lead(self, task: DiscountTask, values: np.ndarray, k: int, index: Index) -> np.ndarray:
+        """The shift with which a candidate is not better than the k-th one anywhere in listed cells, (count,)."""
+        other, shift = self.kept[k]
+        pair = (values, other) if self.sign > 0 else (other, values)
+        return (point(task.spline.largest_difference(*pair, index)) + point(shift)).hi
+
+    def narrowed(
+        self, task: DiscountTask, candidates: Sequence[np.ndarray], sizes: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """The required shifts of the cells that a correction changes, if all leads count and not only the first."""
+        found, level = [each.copy() for each in sizes], float(np.max(sizes)) / LEVEL
+        for each, own in zip(candidates, found, strict=True):
+            index = np.nonzero(own > level)
+            for k in range(len(self.kept)):
+                own[index] = np.minimum(own[index], self.lead(task, each, k, index))
+        return found
+
+
+def is_beaten(task: DiscountTask, candidates: Sequence[np.ndarray], i: int, sign: int) -> np.ndarray:
+    """True in cells in which another candidate with the same shift is better everywhere, (*cells)."""
+    others = [each for k, each in enumerate(candidates) if k != i]
+    worse = [task.spline.range(sign * (candidates[i] - other)).hi < 0 for other in others]
+    return np.logical_or.reduce([np.zeros(task.spline.shape, bool), *worse])
+
+
+def required(
+    task: DiscountTask, candidates: Sequence[np.ndarray], leads: Sequence[np.ndarray], sign: int, level: float
+) -> tuple[list[np.ndarray], float]:
+    """The shift that every cell requires of every candidate, if all have the same shift, and the largest defect.
+
+    Args:
+      task: the data of the bounds.
+      candidates: the candidates, (*grid) each.
+      leads: their leads, (*cells) each; zero where nothing is required.
+      sign: 1 for a lower and −1 for an upper bound.
+      level: a lead up to this number counts as required, instead of a defect that may be smaller.
+    """
+    sizes, largest = [], 0.0
+    for each, lead in zip(candidates, leads, strict=True):
+        some = lead > level
+        need = sizes_of(task.defects(each, some), np.inf, sign)
+        sizes.append(np.minimum(need, lead))
+        largest = max(largest, float(np.max(need[some], initial=0.0)))
+    return sizes, largest

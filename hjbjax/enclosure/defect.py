@@ -13,7 +13,8 @@ At a constrained end the first condition suffices for a lower bound.
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -24,12 +25,13 @@ from hjbjax.enclosure.minimum import control_defect
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
 from hjbjax.tracing import intervals as iv
+from hjbjax.tracing import quadratics as qu
 from hjbjax.tracing import taylor_forms as tf
 from hjbjax.tracing.intervals import Interval, point, quietly
 from hjbjax.tracing.taylor_forms import Form
 
 BLOCK = 8192  # cells that are evaluated together: the arrays of one operation stay in the cache
-Index = tuple[np.ndarray, ...]
+Index = tuple[np.ndarray, ...]  # arrays that broadcast together: one axis for a list of cells, or one per axis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +55,7 @@ class CellBlock:
 
     Attributes:
       index: the number of each cell along every axis.
-      number: the number of parts of a cell.
+      number: the number of parts of a cell, which follow each other along the last axis.
       cells: the parts.
       known: the functions of the problem.
       walls: the axes whose walls stop the paths, with the side of each part: −1 for the lower and 1 for the upper end.
@@ -67,6 +69,11 @@ class CellBlock:
     walls: dict[int, np.ndarray]
     ended: np.ndarray | None = None
 
+    @property
+    def inputs(self) -> int:
+        """The number of inputs of both players."""
+        return sum(each.dim for each in admissible_sets(self.known.problem) if each is not None)
+
 
 @quietly
 def blocks(problem: Problem, grid: Grid, spline: Spline, index: Index, depth: int) -> list[CellBlock]:
@@ -79,33 +86,103 @@ def blocks(problem: Problem, grid: Grid, spline: Spline, index: Index, depth: in
       index: the number of each cell along every axis.
       depth: the number of bisections along every axis: each cell is cut into 2^depth parts along it.
     """
-    sides = _sides(index, spline)
-    projected = set(grid.sides("projected"))
-    walls = [np.isin(side, [step for axis_, step in projected if axis_ == axis]) for axis, side in enumerate(sides)]
-    walls = [wall & (side != 0) for wall, side in zip(walls, sides, strict=True)]
-    found = []
+    projected, found = set(grid.sides("projected")), []
     for stopped in itertools.chain.from_iterable(
         itertools.combinations(range(grid.ndim), count) for count in range(grid.ndim + 1)
     ):
-        chosen = np.logical_and.reduce([walls[axis] for axis in stopped]) if stopped else np.ones(len(index[0]), bool)
-        own, at = [each[chosen] for each in index], [each[chosen] for each in sides]
         cut = [0 if axis in stopped else depth for axis in range(grid.ndim)]
         number = 2 ** sum(cut)
-        step = max(1, BLOCK // number)
-        for first in range(0, len(own[0]), step):
-            some = slice(first, first + step)
-            block, side = tuple(i[some] for i in own), [each[some] for each in at]
-            parts = _parts(grid, side, cut, stopped)
-            cells = spline.cells([np.repeat(i, number) for i in block], parts)
+        for block in _split(_at_walls(index, spline, projected, stopped), max(1, BLOCK // number)):
+            side = _sides(block, spline)
+            cells = spline.cells([np.repeat(i, number, axis=-1) for i in block], _parts(grid, side, cut, stopped))
             x = tf.coordinates(cells.ranges, cells.centres, grid.ndim)
-            signs = {axis: np.repeat(side[axis], number) for axis in stopped}
+            signs = {axis: np.repeat(side[axis], number, axis=-1) for axis in stopped}
             ended = None
             if problem.target is not None:
                 (level,) = tf.taylor_forms(problem.target, x).reshape(-1)
-                ended = np.broadcast_to(level.bounds(cells.radii).hi <= 0, cells.ranges[0].lo.shape)
+                ended = level.bounds(cells.radii).hi <= 0
             known = functions_over(problem, x, cells.radii)
             found.append(CellBlock(block, number, cells, known, signs, ended))
     return found
+
+
+def _at_walls(index: Index, spline: Spline, projected: set[tuple[int, int]], stopped: Sequence[int]) -> Index:
+    """The cells at a wall along every one of some axes."""
+    sides = _sides(index, spline)
+    walls = {axis: np.isin(sides[axis], [step for other, step in projected if other == axis]) for axis in stopped}
+    walls = {axis: wall & (sides[axis] != 0) for axis, wall in walls.items()}
+    if index[0].ndim == 1:  # a list
+        chosen = np.logical_and.reduce([np.ones(len(index[0]), bool), *walls.values()])
+        return tuple(i[chosen] for i in index)
+    return tuple(np.compress(walls[axis].ravel(), i, axis=axis) if axis in walls else i for axis, i in enumerate(index))
+
+
+def _split(index: Index, size: int) -> Iterator[Index]:
+    """Parts of an index with at most this number of cells."""
+    shape = np.broadcast_shapes(*(i.shape for i in index))
+    pieces, left = [], size
+    for length in reversed(shape):
+        step = max(1, min(length, left))
+        pieces.append([slice(first, first + step) for first in range(0, length, step)])
+        left //= step
+    for piece in itertools.product(*reversed(pieces)):
+        yield tuple(
+            i[tuple(some if length > 1 else slice(None) for some, length in zip(piece, i.shape, strict=True))]
+            for i in index
+        )
+
+
+def chosen_cells(known: Sequence[CellBlock], chosen: np.ndarray) -> list[CellBlock]:
+    """Blocks of the cells with a mark, (*cells), from blocks of whole cells. Those at walls stay whole."""
+    found: list[CellBlock] = []
+    for block in known:
+        some = np.nonzero(chosen[block.index])
+        if not len(some[0]):
+            continue
+        if block.walls or len(some[0]) == np.size(chosen[block.index]):
+            found.append(block)
+            continue
+        take = _Taken(some)
+        functions = dataclasses.replace(block.known, **{
+            name: take(getattr(block.known, name)) for name in ("x", "radii", "rate", "unit", "options")
+        })  # fmt: skip
+        index = tuple(take(each) for each in block.index)
+        found.append(CellBlock(index, 1, take(block.cells), functions, {}, take(block.ended)))
+    return found
+
+
+class _Taken:
+    """Some cells of arrays over the cells of a block, in any structure of them.
+
+    Args:
+      index: the number of each cell along every axis.
+    """
+
+    def __init__(self, index: Index) -> None:
+        self.index, self.known = index, dict[int, Any]()
+
+    def __call__(self, tree: Any) -> Any:
+        # an array that occurs twice stays one array: a number is the same at both ends of its interval
+        if id(tree) not in self.known:
+            self.known[id(tree)] = tree, self._taken(tree)
+        return self.known[id(tree)][1]
+
+    def _taken(self, tree: Any) -> Any:
+        if isinstance(tree, np.ndarray):
+            if tree.ndim < len(self.index):
+                return tree
+            shape = tree.shape[-len(self.index) :]
+            places: list[Any] = [i if length > 1 else 0 * i for i, length in zip(self.index, shape, strict=True)]
+            return tree[(..., *places)]
+        if dataclasses.is_dataclass(tree) and not isinstance(tree, type):
+            return dataclasses.replace(
+                tree, **{each.name: self(getattr(tree, each.name)) for each in dataclasses.fields(tree)}
+            )
+        if isinstance(tree, dict):
+            return type(tree)({key: self(each) for key, each in tree.items()})
+        if isinstance(tree, (list, tuple)):
+            return type(tree)(self(each) for each in tree)
+        return tree
 
 
 def _sides(index: Index, spline: Spline) -> list[np.ndarray]:
@@ -125,12 +202,12 @@ def parts_of(grid: Grid, spline: Spline, index: Index, depth: int, stopped: Sequ
       stopped: axes along which a part is only the middle of its cell, which is a node.
     """
     ends = _parts(grid, _sides(index, spline), [depth] * grid.ndim, stopped)
-    return spline.cells([np.repeat(i, 2 ** (depth * grid.ndim)) for i in index], ends)
+    return spline.cells([np.repeat(i, 2 ** (depth * grid.ndim), axis=-1) for i in index], ends)
 
 
 def all_cells(spline: Spline) -> Index:
     """The numbers of all cells along every axis."""
-    return tuple(each.ravel() for each in np.meshgrid(*map(np.arange, spline.shape), indexing="ij"))
+    return np.ix_(*map(np.arange, spline.shape))  # functions of one coordinate are evaluated once per number
 
 
 @quietly
@@ -144,8 +221,7 @@ def defects(spline: Spline, known: Sequence[CellBlock], values: np.ndarray, befo
       before: the defects so far, if the blocks do not contain all cells.
     """
     if before is None:
-        inputs = sum(each.dim for each in admissible_sets(known[0].known.problem) if each is not None)
-        policy = np.zeros((*spline.shape, inputs))
+        policy = np.zeros((*spline.shape, known[0].inputs if known else 0))
         before = Defects(np.full(spline.shape, -np.inf), np.full(spline.shape, np.inf), policy)
     total = Defects(before.low.copy(), before.high.copy(), before.policy)
     for block in known:
@@ -155,13 +231,50 @@ def defects(spline: Spline, known: Sequence[CellBlock], values: np.ndarray, befo
         low, high = found.ends
         if block.ended is not None:
             low, high = np.where(block.ended, np.inf, low), np.where(block.ended, -np.inf, high)
-        low, high = (each.reshape(-1, block.number) for each in (low, high))
-        total.low[block.index] = np.minimum(total.low[block.index], low.min(axis=1))
-        total.high[block.index] = np.maximum(total.high[block.index], high.max(axis=1))
+        low, high = (each.reshape(*each.shape[:-1], -1, block.number) for each in (low, high))
+        total.low[block.index] = np.minimum(total.low[block.index], low.min(axis=-1))
+        total.high[block.index] = np.maximum(total.high[block.index], high.max(axis=-1))
         if not block.walls:
-            total.policy[block.index] = policy.reshape(-1, block.number, policy.shape[-1])[:, 0]
+            total.policy[block.index] = policy.reshape(*low.shape, policy.shape[-1])[..., 0, :]
     # both enclose the same numbers
     return Defects(np.maximum(total.low, before.low), np.minimum(total.high, before.high), total.policy)
+
+
+@quietly
+def policy(spline: Spline, known: Sequence[CellBlock], values: np.ndarray) -> np.ndarray:
+    """The control of ``Defects`` from numbers at the centres of the cells only.
+
+    Args:
+      spline: the cells.
+      known: blocks of all cells.
+      values: the coefficients of W.
+    """
+    found = np.zeros((*spline.shape, known[0].inputs))
+    for block in known:
+        if not block.walls:
+            w, p = block.cells.at_centres(values)
+            found[block.index] = over_block(_at_centres(block), w, p)[1]
+    return found
+
+
+def _at_centres(block: CellBlock) -> CellBlock:
+    """A block with the numbers at the centres of its cells instead of ranges."""
+    known = block.known
+
+    def number(form: Form) -> Form:
+        return Form(form.centre, form.centre)
+
+    options = [
+        (qu.Polynomial({term: number(each) for term, each in cost.items()}), [
+            qu.Polynomial({term: number(each) for term, each in component.items()}) for component in drift
+        ])
+        for cost, drift in known.options
+    ]  # fmt: skip
+    functions = Functions(
+        known.problem, list(map(number, known.x)), [0 * each for each in known.radii], number(known.rate), known.unit,
+        options,
+    )  # fmt: skip
+    return dataclasses.replace(block, known=functions)
 
 
 def _parts(
@@ -172,17 +285,14 @@ def _parts(
     places = np.meshgrid(*map(np.arange, counts), indexing="ij")
     found = []
     for axis, (side, count, place) in enumerate(zip(sides, counts, places, strict=True)):
-        if axis in stopped:  # an end of an axis is the middle of its cell
-            middle = np.full(len(side) * place.size, 0.5)
-            found.append((middle, middle))
-            continue
         overlap = SEAM * grid.periodic[axis]  # both halves of a cell at the seam must cover it
-        lower = np.where(side < 0, 0.5 - overlap, 0.0)[:, None]
-        upper = np.where(side > 0, 0.5 + overlap, 1.0)[:, None]
+        lower = np.where(side < 0, 0.5 - overlap, 0.0)[..., None]
+        upper = np.where(side > 0, 0.5 + overlap, 1.0)[..., None]
+        if axis in stopped:  # an end of an axis is the middle of its cell
+            lower = upper = np.full_like(lower, 0.5)
         share = place.ravel() / count
-        found.append(
-            ((lower + (upper - lower) * share).ravel(), (lower + (upper - lower) * (share + 1 / count)).ravel())
-        )
+        ends = lower + (upper - lower) * share, lower + (upper - lower) * (share + 1 / count)
+        found.append((ends[0].reshape(*side.shape[:-1], -1), ends[1].reshape(*side.shape[:-1], -1)))
     return found
 
 

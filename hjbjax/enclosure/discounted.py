@@ -27,13 +27,15 @@ FALLS = 0.7  # a defect correction must reduce the mean defect to this fraction,
 HELPS = 0.6  # other candidates are tried if a correction leaves more than this fraction of the shift
 SMOOTHER = 3  # the largest number of times that a candidate is smoothed
 STAGNANT = 2  # stop after this number of corrections without progress
-BISECTIONS = 2  # bisections of the cells with the largest defects
+BISECTIONS = 2  # largest number of bisections of a cell
+PASSES = 3  # times that the cells with the largest defects are bisected once more after the last correction
 LARGEST = 0.5  # cells with at least this fraction of the largest defect are bisected
-SHARE = 0.03  # largest fraction of the cells that are bisected: their parts take as long as half of all cells
+SHARE = 0.03  # largest fraction of the cells that are bisected at a time: their parts take as long as half of all cells
 WORTH = 0.97  # bisect only if the other cells require less than this fraction of the shift
 GAIN = 0.97  # progress means that less than this fraction of the width is left
 Kept: TypeAlias = list[tuple[np.ndarray, float]]  # the candidates of a bound, and their shifts
 Move = Callable[[np.ndarray], np.ndarray]
+Start = Callable[[int], tuple[np.ndarray, Defects]]  # coefficients and their defects by the number of smoothings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,21 +58,26 @@ class DiscountTask:
     wanted: float
     chosen: np.ndarray
 
-    def defects(self, values: np.ndarray) -> Defects:
-        """The defects of the spline with these coefficients."""
-        return defect.defects(self.spline, self.known, values)
+    def defects(self, values: np.ndarray, some: np.ndarray | None = None) -> Defects:
+        """The defects of the spline with these coefficients; infinite outside the cells ``some``, (*cells)."""
+        known = self.known if some is None else defect.chosen_cells(self.known, some)
+        return defect.defects(self.spline, known, values)
 
-    def mover(self, found: Defects) -> Move:
+    def policy(self, values: np.ndarray) -> np.ndarray:
+        """The control that is optimal for the spline in every cell, (*cells, m); proves nothing."""
+        return defect.policy(self.spline, self.known, values)
+
+    def mover(self, policy: np.ndarray) -> Move:
         """The correction of the coefficients as a function of a source at the nodes, relative to the discount."""
         rates, weights = self.rates()
-        solve = functools.cache(lambda: self.solver(found, rates))  # not needed if the defect is unbounded
+        solve = functools.cache(lambda: self.solver(policy, rates))  # not needed if the defect is unbounded
         return lambda source: solve()(weights * source)
 
-    def solver(self, found: Defects, rates: np.ndarray) -> Move:
-        """The solution E of (β − L^π) E = s as a function of s, where π is the control that is optimal for W."""
-        inputs = [correction.on_nodes(found.policy[..., j], self.grid) for j in range(found.policy.shape[-1])]
-        policy = np.stack(inputs, axis=-1) if inputs else np.zeros((*self.grid.shape, 0))
-        return correction.solver(self.problem, self.grid, policy, rates)
+    def solver(self, policy: np.ndarray, rates: np.ndarray) -> Move:
+        """The solution E of (β − L^π) E = s as a function of s, where π is a control in every cell, (*cells, m)."""
+        inputs = [correction.on_nodes(policy[..., j], self.grid) for j in range(policy.shape[-1])]
+        at_nodes = np.stack(inputs, axis=-1) if inputs else np.zeros((*self.grid.shape, 0))
+        return correction.solver(self.problem, self.grid, at_nodes, rates)
 
     def remaining(self, upper: Bound) -> np.ndarray:
         """The influence of the projected ends, see ``Enclosure.remaining``."""
@@ -94,7 +101,7 @@ class DiscountTask:
         middle = (found.low + found.high) / 2
         return middle if np.all(np.isfinite(middle)) else None
 
-    def corrected(self, values: np.ndarray) -> tuple[np.ndarray, Defects, Move]:
+    def corrected(self, values: np.ndarray) -> tuple[Start, Move]:
         """The coefficients after defect corrections, as long as the mean defect falls, their defects, and ``mover``.
 
         The control hardly changes, so the equations of all corrections are factored once.
@@ -104,7 +111,7 @@ class DiscountTask:
         smoothed = self.spline.at(nodes).values(values).lo.reshape(self.grid.shape)
         values = self.continued(2 * values - smoothed)
         found = self.defects(values)
-        middle, move = self.middle(found), self.mover(found)
+        middle, move = self.middle(found), self.mover(found.policy)
         for _ in range(SMOOTHING):
             if middle is None:
                 break
@@ -114,9 +121,9 @@ class DiscountTask:
             if remains is None or not np.mean(np.abs(remains)) < FALLS * np.mean(np.abs(middle)):
                 break
             values, found, middle = changed, after, remains
-        return values, found, move
+        return self.smoother(values, found), move
 
-    def bound(self, values: np.ndarray, found: Defects, move: Move, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
+    def bound(self, start: Start, move: Move, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
         """The best bound after corrections, and the shift that the cell around each node requires without them.
 
         Raises:
@@ -125,7 +132,7 @@ class DiscountTask:
         kept: Kept = []
         best, stagnant = np.full(self.grid.shape, -np.inf), 0
         required = np.zeros(self.grid.shape)
-        values, found = self.start(values, found, sign)
+        values, found = self.start(start, sign)
         lead = self.lead(values, kept, sign)
         for turn in range(rounds):
             before = float(np.max(sizes_of(found, lead, sign)))
@@ -152,15 +159,27 @@ class DiscountTask:
         levels = tuple(Levels.shifted(shift, sign) for shift in shifts)
         return Bound(self.spline, coefficients, levels, sign), required
 
-    def start(self, values: np.ndarray, found: Defects, sign: int) -> tuple[np.ndarray, Defects]:
+    def smoother(self, values: np.ndarray, found: Defects) -> Start:
+        """The coefficients with their defects after a number of smoothings, computed once for both bounds."""
+
+        @functools.cache
+        def start(count: int) -> tuple[np.ndarray, Defects]:
+            if count == 0:
+                return values, found
+            smoother = self.continued(correction.mollified(start(count - 1)[0], self.grid))
+            return smoother, self.defects(smoother)
+
+        return start
+
+    def start(self, start: Start, sign: int) -> tuple[np.ndarray, Defects]:
         """The candidate, or a smoother one that requires a far smaller shift, and its defects.
 
         H is concave in the slope, so a mean of W over nearby states is about as good a lower bound as W. It smooths the
         kinks, around which the spline of V oscillates.
         """
-        for _ in range(SMOOTHER):
-            smoother = self.continued(correction.mollified(values, self.grid))
-            after = self.defects(smoother)
+        values, found = start(0)
+        for k in range(SMOOTHER):
+            smoother, after = start(k + 1)
             shifts = [float(np.max(sizes_of(each, np.inf, sign))) for each in (found, after)]
             lost = float(np.mean(sign * (values - smoother)[self.chosen]))
             if not (shifts[1] < FALLS * shifts[0] and shifts[1] + lost < shifts[0]):
@@ -174,7 +193,7 @@ class DiscountTask:
         """
         found = np.full(self.spline.shape, np.inf)
         for other, shift in kept:
-            found = np.minimum(found, (point(self.spline.largest(sign * (values - other))) + point(shift)).hi)
+            found = np.minimum(found, (point(self.spline.range(sign * (values - other)).hi) + point(shift)).hi)
         return found
 
     def better(
@@ -188,7 +207,7 @@ class DiscountTask:
         the motion does not count and W must be the value of resting there.
         """
         options: list[tuple[float, np.ndarray, Defects, np.ndarray, Move]] = []
-        along, fresh = correction.smooth_cover(excess, self.grid), self.mover(found)
+        along, fresh = correction.smooth_cover(excess, self.grid), self.mover(found.policy)
         for step, used in ((lambda: move(along), move), (lambda: fresh(along), fresh), (lambda: excess, fresh)):
             option = values - sign * step()
             after, lead = self.defects(option), self.lead(option, kept, sign)
@@ -200,20 +219,26 @@ class DiscountTask:
 
     def bisected(self, values: np.ndarray, found: Defects, lead: np.ndarray, sign: int) -> Defects:
         """The defects after the cells that determine the shift, at most a fraction ``SHARE``, are cut into parts."""
-        for depth in range(1, BISECTIONS + 1):
+        cuts = np.zeros(self.spline.shape, int)
+        # without a further correction only the largest defect counts, which fewer parts reduce
+        is_last = bool(np.max(sizes_of(found, lead, sign)) <= self.wanted / 4)
+        for turn in range(PASSES if is_last else BISECTIONS):
             sizes = sizes_of(found, lead, sign)
             if not np.all(np.isfinite(sizes)):
                 break
             level = max(LARGEST * np.max(sizes), np.quantile(sizes, 1 - SHARE))
             if level > WORTH * np.max(sizes):  # the shift hardly falls, because other cells require almost the same
                 break
-            chosen = sizes >= level
+            chosen = (sizes >= level) & (cuts < BISECTIONS)
             # where the range of the defect is narrow, its largest value is already known
             chosen &= found.high - found.low > 0.2 * np.abs(sizes)
             if not np.any(chosen):
                 break
-            parts = defect.blocks(self.problem, self.grid, self.spline, np.nonzero(chosen), depth)
-            found = defect.defects(self.spline, parts, values, found)
+            cuts[chosen] = cuts[chosen] + 1 if is_last else turn + 1
+            for depth in np.unique(cuts[chosen]):
+                index = np.nonzero(chosen & (cuts == depth))
+                parts = defect.blocks(self.problem, self.grid, self.spline, index, int(depth))
+                found = defect.defects(self.spline, parts, values, found)
         return found
 
 

@@ -96,8 +96,8 @@ def enclose(
         else:
             task = exit_task(own, grid, spline, value, chosen, scale * tol)
             bound = task.bound
-        middle, found, move = task.corrected(value)
-        bounds = [bound(middle, found, move, sign, count) for sign in (1, -1)]
+        first, move = task.corrected(value)
+        bounds = [bound(first, move, sign, count) for sign in (1, -1)]
         remaining = task.remaining(bounds[1][0])
     if problem.payoff == REWARD:
         bounds = [(each.negative(), sizes) for each, sizes in reversed(bounds)]

@@ -89,13 +89,11 @@ def _middle(each: Interval | None) -> np.ndarray:
 @quietly
 def exit_of(problem: Problem, grid: Grid, spline: Spline) -> Exit:
     """The target of a problem in the cells of a grid."""
-    every = defect.all_cells(spline)
-    whole = defect.parts_of(grid, spline, every, 0)
+    whole = defect.parts_of(grid, spline, defect.all_cells(spline), 0)
     level, paid = _functions(problem, grid, whole)
     reach, cost = level.bounds(whole.radii), paid.bounds(whole.radii)
     inside, meets, least, largest = (
-        np.broadcast_to(each, every[0].shape).reshape(spline.shape)
-        for each in (reach.hi <= 0, ~(reach.lo > 0), cost.lo, cost.hi)
+        np.broadcast_to(each, spline.shape) for each in (reach.hi <= 0, ~(reach.lo > 0), cost.lo, cost.hi)
     )
     cut = np.nonzero(meets & ~inside)
     if not len(cut[0]):

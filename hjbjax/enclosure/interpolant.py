@@ -11,6 +11,7 @@ bound of their rounding errors is added: the largest node value times a number t
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 
 from hjbjax.problem.grid import Grid
 from hjbjax.tracing.intervals import EPS, Interval, point
-from hjbjax.tracing.taylor_forms import Form
+from hjbjax.tracing.taylor_forms import Form, constant
 
 # for every axis the lower and the upper ends of parts of the unit cells, dyadic numbers, (count,)
 Ends = Sequence[tuple[np.ndarray, np.ndarray]]
@@ -162,17 +163,18 @@ def _restricted(rows: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.nda
 
 
 def _contracted(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The sums over the first axis of values (3, ..., count) with weights (r, 3, count): shape (..., r, count)."""
-    fill = (slice(None), *(None,) * (values.ndim - 2), slice(None))
+    """The sums over the first axis of values (3, ..., *cells) with weights (r, 3, *cells): shape (..., r, *cells)."""
+    cells = rows.ndim - 2
+    fill = (slice(None), *(None,) * (values.ndim - 1 - cells))
     total = rows[:, 0][fill] * values[0]
     for k in range(1, POINTS):
         total += rows[:, k][fill] * values[k]
-    return np.moveaxis(total, 0, -2)
+    return np.moveaxis(total, 0, -1 - cells)
 
 
 def with_largest(values: np.ndarray) -> tuple[np.ndarray, float]:
     """Coefficients and their largest absolute value; zeros and infinity if one is too large or NaN."""
-    largest = float(np.max(np.abs(values)))
+    largest = float(np.max(np.abs(values), initial=0.0))
     return (values, largest) if largest <= LARGEST else (np.zeros_like(values), np.inf)
 
 
@@ -216,6 +218,18 @@ class Cells:
 
         return form(), [form(i) for i in range(n)]
 
+    def at_centres(self, values: np.ndarray) -> tuple[Form, list[Form]]:
+        """The spline and its gradient as numbers at the centres, without their rounding errors."""
+        stencil, n = with_largest(values)[0][self.stencil], len(self.middles)
+
+        def number(axis: int | None) -> Form:
+            found = stencil
+            for k, rows in enumerate(self.middles):
+                found = _contracted(rows[k == axis], found)
+            return constant(found.reshape(found.shape[n:]))
+
+        return number(None), [number(axis) for axis in range(n)]
+
     def _derivatives(self, values: np.ndarray) -> dict[tuple[int, ...], tuple[Interval, Interval]]:
         """Per list of axes, at most three, the range of the derivative and its value at the centre."""
         n = len(self.rows)
@@ -224,7 +238,7 @@ class Cells:
 
         def walk(axis: int, orders: tuple[int, ...], whole: np.ndarray, middle: np.ndarray) -> None:
             if axis == n:
-                whole, middle = whole.reshape(-1, whole.shape[-1]), middle.reshape(-1)
+                whole, middle = whole.reshape(-1, *whole.shape[n:]), middle.reshape(middle.shape[n:])
                 error = largest * self._error(orders)
                 axes = tuple(k for k, order in enumerate(orders) for _ in range(order))
                 ranges = Interval(whole.min(axis=0) - error, whole.max(axis=0) + error)
@@ -279,7 +293,7 @@ class Spline:
     def _stencil(self, index: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
         n = len(self.tables)
         return tuple(
-            table.nodes[i].T.reshape(*(1,) * axis, POINTS, *(1,) * (n - 1 - axis), -1)
+            np.moveaxis(table.nodes[i], -1, 0).reshape(*(1,) * axis, POINTS, *(1,) * (n - 1 - axis), *i.shape)
             for axis, (table, i) in enumerate(zip(self.tables, index, strict=True))
         )
 
@@ -312,22 +326,63 @@ class Spline:
             found.radii.append(np.nextafter(np.maximum(box.hi - place.lo, place.hi - box.lo), np.inf))
         return found
 
-    def largest(self, values: np.ndarray) -> np.ndarray:
-        """An upper bound of the spline with some coefficients in every cell inside the box, shape (*cells)."""
-        n, error = len(self.tables), np.zeros(())
-        values, largest = with_largest(values)
-        size, found = np.full((), largest), values[None]
-        for axis, table in enumerate(self.tables):
-            weights, start, stop = table.weights[0], *(np.full(len(table.nodes), end) for end in (0.0, 1.0))
+    @functools.cached_property
+    def _inside(self) -> list[np.ndarray]:
+        """Per axis the weights (3, 3, cells) of the Bézier coefficients over the part of every cell inside the box."""
+        found = []
+        for table in self.tables:
+            start, stop = (np.full(len(table.nodes), end) for end in (0.0, 1.0))
             if not table.periodic:
                 start[0] = stop[-1] = 0.5
-            rows = _restricted(weights.rows, start, stop)
-            around = [np.moveaxis(found, axis + 1, -1)[..., k] for k in table.nodes.T]
-            parts = [sum(row[k] * around[k] for k in range(POINTS)) for row in rows]
-            found = np.moveaxis(np.concatenate(parts), -1, axis + 1)
-            fill = (slice(None), *(None,) * (n - 1 - axis))
-            error, size = error + (weights.error / weights.size)[fill], size * weights.size[fill]
-        return found.max(axis=0) + 2 * size * error
+            found.append(_restricted(table.weights[0].rows, start, stop))
+        return found
+
+    @functools.cached_property
+    def _slack(self) -> float:
+        """A bound of the error of a Bézier coefficient for node values up to one."""
+        size, error = 1.0, 0.0
+        for weights in (table.weights[0] for table in self.tables):
+            size, error = size * float(np.max(weights.size)), error + float(np.max(weights.error / weights.size))
+        return 2 * size * error
+
+    def range(self, values: np.ndarray) -> Interval:
+        """Bounds of the spline with some coefficients in every cell inside the box, shape (*cells)."""
+        values, largest = with_largest(values)
+        low, high = self._ends(values, 0)
+        slack = largest * self._slack
+        return Interval(low - slack, high + slack)
+
+    def _ends(self, values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the largest Bézier coefficient of every cell along the axes from one on."""
+        if axis == len(self.tables):
+            return values, values
+        table, rows = self.tables[axis], self._inside[axis]
+        around = np.moveaxis(values, axis, 0)
+        fill = (slice(None), *(None,) * (values.ndim - 1))
+
+        def combined(row: int, cells: slice) -> np.ndarray:
+            nodes = table.nodes[cells]
+            return sum(rows[row, k, cells][fill] * around[nodes[:, k]] for k in range(POINTS))
+
+        # two cells have the coefficient at the knot between them in common, and the middle one is that of the node
+        knots = np.concatenate([combined(0, slice(None)), combined(2, slice(-1, None))])
+        middles = np.concatenate([combined(1, slice(1)), around[table.nodes[1:-1, 1]], combined(1, slice(-1, None))])
+        low, high = ([], [])
+        for each in (knots, middles):
+            least, most = self._ends(np.moveaxis(each, 0, axis), axis + 1)
+            low.append(np.moveaxis(least, axis, 0))
+            high.append(np.moveaxis(most, axis, 0))
+        least = np.minimum(np.minimum(low[0][:-1], low[0][1:]), low[1])
+        most = np.maximum(np.maximum(high[0][:-1], high[0][1:]), high[1])
+        return np.moveaxis(least, 0, axis), np.moveaxis(most, 0, axis)
+
+    def largest_difference(self, values: np.ndarray, other: np.ndarray, index: Sequence[np.ndarray]) -> np.ndarray:
+        """An upper bound of the difference of two splines in listed cells inside the box, shape (count,)."""
+        stencil = self._stencil(index)
+        found, largest = with_largest(values[stencil] - other[stencil])
+        for rows, i in zip(self._inside, index, strict=True):
+            found = _contracted(rows[..., i], found)
+        return found.max(axis=tuple(range(len(index)))) + largest * self._slack
 
     def index(self, states: np.ndarray) -> tuple[np.ndarray, ...]:
         """The number of the cell of every state along every axis."""

@@ -121,7 +121,7 @@ def least_over(admissible: Any, terms: qu.Polynomial) -> tuple[Form, Actions, li
         return least, actions, near
     if isinstance(admissible, Ball):
         radius = float(admissible.radius)
-        length = norm(b)
+        length = tf.norm(b)
         part, _, distance = least_quadratic(-length, _common(squares), 0.0, radius)
         whole = Interval(np.array(-radius), np.array(radius))
         size = np.maximum(length.centre.hi, iv.TINY)
@@ -145,37 +145,6 @@ def _common(squares: Sequence[Form | None]) -> Form:
     if len(known) < len(squares) or len(ends) != 1 or any(each.slopes or np.size(each.range.lo) > 1 for each in known):
         raise qu.NotQuadraticError
     return known[0]
-
-
-def norm(b: Sequence[Form]) -> Form:
-    """The Euclidean norm. Where it may be zero, its derivative is the range over all directions."""
-
-    def function(*ranges: Interval) -> Interval:
-        total = iv.squared(ranges[0])
-        for each in ranges[1:]:
-            total = total + iv.squared(each)
-        return iv.square_root(Interval(np.maximum(total.lo, 0.0), total.hi))
-
-    def derivatives(*ranges: Interval) -> list[Interval]:
-        length = function(*ranges)
-        found = [each / length for each in ranges]
-        return [Interval(np.maximum(each.lo, -1.0), np.minimum(each.hi, 1.0)) for each in found]
-
-    def seconds(*ranges: Interval) -> tf.Curvature:
-        length = function(*ranges)
-        cubed = iv.power(length, 3)
-        found: tf.Curvature = {}
-        for i, j in itertools.combinations_with_replacement(range(len(ranges)), 2):
-            found[i, j] = -(ranges[i] * ranges[j] / cubed)
-            if i == j:
-                others = point(0.0)
-                for k, other in enumerate(ranges):
-                    if k != i:
-                        others = others + iv.squared(other)
-                found[i, j] = others / cubed
-        return found
-
-    return tf.apply(function, derivatives, seconds, *b)
 
 
 def least_quadratic(b: Form, c: Form, lo: float, hi: float) -> tuple[Form, Interval, np.ndarray]:

@@ -190,6 +190,7 @@ class TubeTask:
             needed = max(needed, float(np.max(np.where(low < level, bound, -np.inf))))
         return needed
 
+    @quietly
     def threshold(self, found: Sides, ranges: tuple[np.ndarray, np.ndarray], level: float, side: int) -> np.ndarray:
         """σ at the beginning of every time slab and at the horizon, with the sign of the side; infinite if unknown.
 
@@ -208,7 +209,8 @@ class TubeTask:
         table = self.spline.tables[0]
         edges = np.concatenate([table.at[:1], table.between, table.at[-1:]])
         path = np.full(count + 1, np.inf)
-        path[count] = self.at_horizon(level, side)
+        # a level below all W is as good as any lower one
+        path[count] = max(self.at_horizon(level, side), 2 * float(np.min(lo)) - float(np.max(hi)))
         for k in range(count - 1, -1, -1):
             must = np.where(hindered[k] < level, _above(np.minimum(hi[k], level + hinder[k])), -np.inf)
             now = max(float(path[k + 1]), float(np.max(must)))

@@ -3,11 +3,12 @@
 import dataclasses
 import time
 from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 
 from hjbjax.enclosure import checks
-from hjbjax.enclosure.bounds import evaluate_in_box
+from hjbjax.enclosure.bounds import evaluate_in_box, spline_arrays, spline_of
 from hjbjax.enclosure.interpolant import LARGEST, Spline
 from hjbjax.enclosure.tube_levels import Sides, TubeTask
 from hjbjax.problem import arguments
@@ -17,6 +18,7 @@ from hjbjax.problem.pytree import front_door
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.state_bounds import in_unit_box
 from hjbjax.problem.types import Numbers
+from hjbjax.solution import archive, files
 from hjbjax.solution.solution import Solution
 from hjbjax.solvers import memory
 from hjbjax.tracing import closures
@@ -29,7 +31,7 @@ WORTH = 0.3  # a cell is bisected if its rate exceeds this fraction of the mean 
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class TubeEnclosure:
+class TubeEnclosure(files.Saved):
     """Two sets at t = 0, one inside and one outside a tube; made by ``enclose_tube``.
 
     Args:
@@ -47,6 +49,8 @@ class TubeEnclosure:
       thresholds: W ≥ the first one proves V > v, or V ≥ v for ``avoid``, and −W ≥ the second one V ≤ v, or V < v.
       above: True for ``avoid``.
     """
+
+    FORMAT = "hjbjax.TubeEnclosure"
 
     grid: Grid
     level: float
@@ -87,6 +91,37 @@ class TubeEnclosure:
 
     def __repr__(self) -> str:
         return f"TubeEnclosure(level {self.level:g}, shifts {self.shifts[0]:.3g} and {self.shifts[1]:.3g})"
+
+    def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        header = {
+            "grid": archive.about_grid(self.grid), "level": self.level, "is_free": self.is_free,
+            "message": self.message, "stats": self.stats, "above": self.above, "times": len(self.spline.tables[0].at),
+        }  # fmt: skip
+        arrays = {"lo": self.grid.lo, "hi": self.grid.hi, "inner": self.inner, "outer": self.outer}
+        arrays |= {"coefficients": self.coefficients}
+        arrays |= {"shifts": np.array(self.shifts), "thresholds": np.array(self.thresholds)}  # may be infinite
+        return header, arrays | spline_arrays(self.spline)
+
+    @staticmethod
+    def _plan(header: dict) -> dict[str, files.Expected]:
+        """The arrays of a file; their shapes follow from its grid and the number of times."""
+        shape, cyclic = archive.shape_of(header["grid"]), header["grid"]["periodic"]
+        shapes: dict[str, tuple[int, ...]] = {name: (len(shape),) for name in ("lo", "hi")}
+        shapes |= {**dict.fromkeys(("inner", "outer"), shape), "coefficients": (FEWEST, *shape)}
+        shapes |= {**dict.fromkeys(("shifts", "thresholds"), (2,)), "axis0": (int(header["times"]),)}
+        shapes |= {f"axis{k + 1}": (count + bool(cyclic[k]),) for k, count in enumerate(shape)}
+        return {name: files.Expected((each,), (np.float64,), optional=False) for name, each in shapes.items()}
+
+    @classmethod
+    def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
+        """The sets with a header and arrays of a file."""
+        grid = archive.grid_of(header["grid"], arrays["lo"], arrays["hi"])
+        first, second = arrays["thresholds"].tolist(), arrays["shifts"].tolist()
+        return cls(
+            grid, header["level"], arrays["inner"], arrays["outer"], (second[0], second[1]), bool(header["is_free"]),
+            header["message"], header["stats"], spline_of(arrays, (False, *grid.periodic)), arrays["coefficients"],
+            (first[0], first[1]), bool(header["above"]),
+        )  # fmt: skip
 
 
 @front_door

@@ -17,13 +17,14 @@ import numpy as np
 from hjbjax.enclosure import correction, defect, walls
 from hjbjax.enclosure.bounds import Bound
 from hjbjax.enclosure.defect import Defects
-from hjbjax.enclosure.discounted import BISECTIONS, STAGNANT, WIDENED, DiscountTask, Move, at_nodes
+from hjbjax.enclosure.discounted import BISECTIONS, STAGNANT, WIDENED, DiscountTask, Move, Start, at_nodes
 from hjbjax.enclosure.exits import DEPTH, Exit, exit_of
 from hjbjax.enclosure.interpolant import Spline
 from hjbjax.enclosure.levels import Levels, levels_of
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.tracing.intervals import Interval, point
+from hjbjax.tracing import taylor_forms as tf
+from hjbjax.tracing.intervals import point
 
 BAD = 0.5  # cells with at least this relative defect are lifted above the others
 LEAK = 0.01  # discount of the corrections, times the range of V over the least cost: keeps their equations regular
@@ -55,9 +56,9 @@ class ExitTask(DiscountTask):
     blank: np.ndarray
     leak: float
 
-    def defects(self, values: np.ndarray) -> Defects:
+    def defects(self, values: np.ndarray, some: np.ndarray | None = None) -> Defects:
         """The defects relative to the least running cost; zero inside the target."""
-        return self.outside(super().defects(values))
+        return self.outside(super().defects(values, some))
 
     def outside(self, found: Defects) -> Defects:
         """The defects with zero inside the target."""
@@ -92,24 +93,25 @@ class ExitTask(DiscountTask):
         ratio = correction.nearest_known(ratio, clear, self.grid)
         return np.where(self.blank, self.paid + ratio * self.level, values)
 
-    def bound(self, values: np.ndarray, found: Defects, move: Move, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
+    def bound(self, start: Start, move: Move, sign: int, rounds: int) -> tuple[Bound, np.ndarray]:
         """The best bound after corrections, and the relative defect of the cell around each node without them.
 
         Raises:
           ValueError: no bound is finite.
         """
         kept: list[tuple[np.ndarray, Levels]] = []
-        base, policy = values, found
+        values, found = start(0)
+        base, policy = values, found.policy
         lifted, required = np.zeros(self.grid.shape, bool), np.zeros(self.grid.shape)
         beyond = np.zeros(self.spline.shape, bool)
         best, stagnant = np.full(self.grid.shape, np.inf), 0
         for _ in range(rounds):
             found = self.refined(values, found, sign)
             sizes = np.where(self.exit.inside, -np.inf, found.high if sign > 0 else -found.low)
-            start, over = self.exit.shift(values, sign)
-            if not np.isfinite(start):
+            shift, over = self.exit.shift(values, sign)
+            if not np.isfinite(shift):
                 break
-            levels, beyond = self.levels(values, sizes, start, sign), beyond | over
+            levels, beyond = self.levels(values, sizes, shift, sign), beyond | over
             if not kept:
                 required = correction.on_nodes(np.maximum(sizes, 0.0), self.grid, np.max)
             kept.append((values, levels))
@@ -147,7 +149,7 @@ class ExitTask(DiscountTask):
 
     def levels(self, values: np.ndarray, sizes: np.ndarray, start: float, sign: int) -> Levels:
         """The function of the spline that is a bound."""
-        ranges = Interval(-self.spline.largest(-values), self.spline.largest(values))
+        ranges = self.spline.range(values)
         there = ~self.exit.inside
         return levels_of(ranges.lo[there], ranges.hi[there], sizes[there], -sign * start, sign)
 
@@ -182,20 +184,20 @@ class ExitTask(DiscountTask):
             found = self.outside(defect.defects(self.spline, parts, values, found))
         return found
 
-    def lift(self, found: Defects, lifted: np.ndarray, values: np.ndarray) -> np.ndarray:
+    def lift(self, policy: np.ndarray, lifted: np.ndarray, values: np.ndarray) -> np.ndarray:
         """The height by which every node is lifted: the probability that paths visit some nodes before they end.
 
         Nodes of the target are lifted too: W may exceed ψ for an upper bound, and be less for a lower bound.
 
         Args:
-          found: the defects with the control.
+          policy: the control in every cell, (*cells, m).
           lifted: True for the nodes that are lifted above all others.
           values: the coefficients.
         """
         if not np.any(lifted):
             return np.zeros(self.grid.shape)
         rates = np.where(lifted, HELD * self.leak, self.rates()[0])
-        return LIFT * float(np.ptp(values)) * np.clip(self.solver(found, rates)(rates * lifted), 0.0, 1.0)
+        return LIFT * float(np.ptp(values)) * np.clip(self.solver(policy, rates)(rates * lifted), 0.0, 1.0)
 
 
 def exit_task(
@@ -204,9 +206,17 @@ def exit_task(
     """The data of the bounds of a problem without a discount.
 
     Raises:
-      ValueError: the running cost is not known to be positive outside the target.
+      ValueError: the target or the exit cost is not a scalar, or NaN somewhere; no cell or every cell is in the target;
+        or the running cost is not known to be positive outside the target.
     """
+    level, paid = _exit_at_nodes(problem, grid)
     exit, unit = exit_of(problem, grid, spline), np.full(spline.shape, np.inf)
+    if np.all(exit.inside) or not np.any(exit.meets):
+        which = "every cell of the grid is inside" if np.all(exit.inside) else "no cell of the grid meets"
+        raise ValueError(
+            f"enclose: {which} the target, where the function of the target is at most zero. Without a discount the\n"
+            "bounds need a target inside the box that leaves other states; check its sign, or use another box"
+        )
     cut = exit.meets & ~exit.inside
     known = [
         each for index, depth in ((~exit.meets, 0), (cut, DEPTH))
@@ -223,11 +233,33 @@ def exit_task(
             f"enclose: the running cost is not known to be positive in the cell at x = {np.round(state, 4).tolist()}.\n"
             "Without a discount the bounds need a positive cost outside the target, for all controls"
         )
-    level = at_nodes(problem.target, grid)
-    cost = problem.exit_cost
-    paid = at_nodes(cost, grid) if callable(cost) else np.full(grid.shape, 0.0 if cost is None else float(cost))
     least = correction.on_nodes(np.where(exit.inside, np.max(unit[~exit.inside]), unit), grid, np.min)
     leak = LEAK * float(np.min(least)) / (float(np.ptp(value)) or 1.0)
     ended = level <= 0
     blank = ended & (np.abs(value - paid) <= BLANK * (float(np.ptp(value)) or 1.0))
     return ExitTask(problem, grid, spline, known, wanted, chosen, exit, least, ended, level, paid, blank, leak)
+
+
+def _exit_at_nodes(problem: Problem, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """The function of the target and the exit cost at the nodes, (*grid).
+
+    Raises:
+      ValueError: one of them is not a scalar, or NaN at a node.
+    """
+    found = []
+    for name, function in (("target", problem.target), ("exit_cost", problem.exit_cost)):
+        if not callable(function):
+            found.append(np.full(grid.shape, 0.0 if function is None else float(function)))
+            continue
+        (shape,) = (each.shape for each in tf.traced(function, [0.0] * grid.ndim).out_avals)
+        if shape:
+            raise ValueError(f"enclose: {name}(x) returned shape {shape}, wanted one number, of shape ()")
+        values = at_nodes(function, grid)
+        if np.any(np.isnan(values)):
+            state = grid.nodes()[np.unravel_index(int(np.argmax(np.isnan(values))), grid.shape)]
+            raise ValueError(
+                f"enclose: {name}(x) is NaN at x = {np.round(state, 4).tolist()}; wanted a number at every state of\n"
+                "the box. Guard square roots, logarithms and quotients with jnp.maximum or jnp.where"
+            )
+        found.append(values)
+    return found[0], found[1]

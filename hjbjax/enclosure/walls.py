@@ -34,14 +34,13 @@ def times(problem: Problem, grid: Grid, spline: Spline) -> np.ndarray:
     ends = grid.sides("projected")
     if not ends:
         return np.full(grid.shape, np.inf)
-    every = all_cells(spline)
-    cells = spline.cells(every)
+    cells = spline.cells(all_cells(spline))
     x = tf.coordinates(cells.ranges, cells.centres, grid.ndim)
     drift = tf.taylor_forms(problem.drift, x, *any_actions(problem))
     soonest = np.full(grid.shape, np.inf)
     for axis, step in ends:
         outward = drift[axis].range.hi if step > 0 else -drift[axis].range.lo
-        speeds = np.broadcast_to(outward, every[0].shape).reshape(spline.shape)
+        speeds = np.broadcast_to(outward, spline.shape)
         layers = np.max(np.maximum(speeds, 0), axis=tuple(k for k in range(grid.ndim) if k != axis))
         gaps = np.diff(np.asarray(grid.axis(axis), float)) * (1 - ROUNDING)
         crossing = gaps / np.maximum(layers[1:], layers[:-1])

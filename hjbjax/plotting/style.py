@@ -39,7 +39,8 @@ NARROW, WIDE, SOLID = (5.4, 4.2), (5.4, 3.2), (5.4, 4.8)  # inches, for planes, 
 LINE, HANDLE = 62, 6  # characters of a line of a legend, and those that a mark and its margins take
 DPI = 200  # default resolution of saved pictures
 STROKES = ("-", "--", "-.", ":")  # the colours of two lines may be one grey in print
-# for an argument name, or function.argument: the attributes that the argument must have, and a description of it
+# for an argument name, or function.argument: the attributes that the argument must have, alternatives separated by
+# "|", and a description of it
 DRAWN: dict[str, tuple[tuple[str, ...], str]] = {
     "solution": (("grid", "value"), "the Solution of solve or march"),
     "path": (("times", "states"), "the Path of simulate"),
@@ -47,7 +48,10 @@ DRAWN: dict[str, tuple[tuple[str, ...], str]] = {
     "extremal": (("times", "costates"), "the extremal of pontryagin"),
     "grid": (("shape", "periodic"), "a Grid, such as solution.grid"),
     "residuals.solution": (("residuals",), "the Solution of solve"),
-    "enclosure": (("grid", "lower", "upper", "required"), "the Enclosure of enclose"),
+    "enclosure": (
+        ("grid", "lower|inner", "upper|outer"),
+        "the Enclosure of enclose, or the TubeEnclosure of enclose_tube",
+    ),
     "convergence.study": (("errors", "fitted"), "the result of convergence_study"),
     "perturbation.study": (("nominal", "noise"), "the result of perturbation_study"),
 }
@@ -71,7 +75,8 @@ def drawing(function: Callable[P, T]) -> Callable[P, T]:
         for number, (name, thing) in enumerate((*zip(names, arguments, strict=False), *options.items())):
             attributes, words = DRAWN.get(f"{function.__name__}.{name}") or DRAWN.get(name, ((), ""))
             # optional arguments may be None
-            if not all(hasattr(thing, attribute) for attribute in attributes) and (thing is not None or number == 0):
+            known = all(any(hasattr(thing, name) for name in each.split("|")) for each in attributes)
+            if not known and (thing is not None or number == 0):
                 raise TypeError(f"{function.__name__}: got {name} = {shown(thing)}, wanted {words}")
         ax = options.get("ax")
         if hasattr(ax, "add_subplot"):

@@ -63,6 +63,10 @@ class Algebra(abc.ABC):
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
         """Results of an equation without a rule."""
 
+    def call(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list | None:
+        """Results of a function that is called by name; None to evaluate its program ``inner``."""
+        return None
+
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list[np.ndarray]:
         """Results of a function with a custom derivative rule, which may differ from its computation ``inner``."""
         return self.nodewise(eqn, operands)
@@ -121,6 +125,8 @@ def _apply(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
     if name in CALLS and CALLS[name] in eqn.params:
         inner = eqn.params[CALLS[name]]  # some calls keep a jaxpr without constants
         inner = inner if jaxprs.is_closed(inner) else jaxprs.closed(inner)
+        if (known := algebra.call(eqn, inner, operands)) is not None:
+            return known
         return (
             algebra.custom_jvp(eqn, inner, operands)
             if name == "custom_jvp_call"
@@ -234,11 +240,17 @@ def _branch(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> list:
 
 def _entrywise(eqn: jex.JaxprEqn, operands: list, algebra: Algebra) -> np.ndarray:
     """Results entry by entry; a scalar combined with an array is used for all entries."""
-    lifted = np.broadcast_arrays(*(lift(value, algebra) for value in operands))
     dtypes = [array_type(var).dtype for var in eqn.invars]
+    return entry_by_entry(
+        lambda *row: algebra.entrywise(eqn.primitive, eqn.params, list(row), dtypes), operands, algebra
+    )
+
+
+def entry_by_entry(function: Callable, operands: Sequence[Operand], algebra: Algebra) -> np.ndarray:
+    """A function of scalars for every entry; an operand with one entry is used for all entries."""
+    lifted = np.broadcast_arrays(*(lift(value, algebra) for value in operands))
     rows = zip(*(value.reshape(-1) for value in lifted), strict=True)
-    results = [algebra.entrywise(eqn.primitive, eqn.params, list(row), dtypes) for row in rows]
-    return object_array(results, lifted[0].shape)
+    return object_array([function(*row) for row in rows], lifted[0].shape)
 
 
 def _reduce(eqn: jex.JaxprEqn, entries: np.ndarray, algebra: Algebra) -> np.ndarray:

@@ -52,6 +52,9 @@ class Interval:
         return Interval(-self.hi, -self.lo)
 
     def __mul__(self, other: Interval) -> Interval:
+        for factor, one in ((self, other), (other, self)):
+            if one is ONE:  # the derivative of a coordinate and of a sum: no arithmetic, and no rounding
+                return factor
         return _hull_of(operator.mul, self, other)
 
     def __truediv__(self, other: Interval) -> Interval:
@@ -72,7 +75,7 @@ class Interval:
         """The larger of two numbers."""
         return Interval(np.maximum(self.lo, other.lo), np.maximum(self.hi, other.hi))
 
-    def scaled(self, factor: float) -> Interval:
+    def scaled(self, factor: float | np.ndarray) -> Interval:
         """The product with a positive number."""
         return outward(self.lo * factor, self.hi * factor)
 
@@ -95,6 +98,9 @@ def point(value: object) -> Interval:
     return Interval(array, array)
 
 
+ONE = point(1.0)
+
+
 def entire(like: Interval) -> Interval:
     """All numbers."""
     shape = np.broadcast(like.lo, like.hi).shape
@@ -107,26 +113,38 @@ def outward(lo: np.ndarray, hi: np.ndarray, relative: float = 0.0, absolute: flo
     A number of size m has units in the last place of at most m · EPS, so the bounds move by a unit or more. This is
     eight times faster than ``np.nextafter``.
     """
-    below, above = np.abs(lo), np.abs(hi)
-    below *= -(EPS + relative)  # in place, because new arrays take a third of the time
-    above *= EPS + relative
-    below -= absolute + TINY
-    above += absolute + TINY
-    below += lo
-    above += hi
-    if _has_nan(below) or _has_nan(above):
+    below, above = _moved(lo, hi, EPS + relative, absolute + TINY)
+    if have_nan(below, above):
         below, above = np.where(np.isnan(below), -np.inf, below), np.where(np.isnan(above), np.inf, above)
     return Interval(below, above)
 
 
-def _has_nan(x: np.ndarray) -> bool:
-    """True if any number is NaN."""
+def _moved(lo: np.ndarray, hi: np.ndarray, relative: float, absolute: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds moved outward by a relative and an absolute error."""
+    below, above = np.abs(lo), np.abs(hi)
+    below *= -relative  # in place, because new arrays take a third of the time
+    above *= relative
+    below -= absolute
+    above += absolute
+    below += lo
+    above += hi
+    return below, above
+
+
+def have_nan(x: np.ndarray, y: np.ndarray) -> bool:
+    """True if any number is NaN; it may also be True if any number is infinite."""
     # a short scalar product is three times faster than a sum; BLAS computes a long one on several threads
-    return bool(np.isnan(np.vdot(x, x) if np.size(x) <= SHORT else np.sum(x)))
+    if np.shape(x) == np.shape(y) and np.size(x) <= SHORT:
+        return bool(np.isnan(np.vdot(x, y)))
+    return bool(np.isnan(np.sum(x)) or np.isnan(np.sum(y)))
 
 
 def _hull_of(operation: Callable, left: Interval, right: Interval) -> Interval:
     """The hull of an operation on all four pairs of ends, for an operation that is monotone in each operand."""
+    if operation is operator.mul:
+        for number, other in ((left, right), (right, left)):
+            if number.lo is number.hi and np.size(number.lo) == 1 and 0 < number.lo < np.inf:
+                return other.scaled(number.lo)
     if left.lo is left.hi:
         pairs = [(left.lo, right.lo), (left.lo, right.hi)]
     elif right.lo is right.hi:
@@ -137,11 +155,12 @@ def _hull_of(operation: Callable, left: Interval, right: Interval) -> Interval:
     lo, hi = ends[0], ends[0]
     for end in ends[1:]:
         lo, hi = np.minimum(lo, end), np.maximum(hi, end)
-    if _has_nan(lo):
-        # 0 · ∞ is 0: the infinite end of an interval is not one of its numbers
-        ends = [np.where(np.isnan(end), 0.0, end) for end in ends]
-        lo, hi = np.minimum.reduce(ends), np.maximum.reduce(ends)
-    return outward(lo, hi)
+    below, above = _moved(lo, hi, EPS, TINY)
+    if not have_nan(below, above):
+        return Interval(below, above)
+    # 0 · ∞ is 0: the infinite end of an interval is not one of its numbers
+    ends = [np.where(np.isnan(end), 0.0, end) for end in ends]
+    return outward(functools.reduce(np.minimum, ends), functools.reduce(np.maximum, ends))
 
 
 def union(*parts: Interval) -> Interval:

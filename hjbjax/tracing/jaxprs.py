@@ -163,6 +163,34 @@ def _in_use(constant: Any) -> Any:
     return constant if constant.dtype == dtype else np.asarray(constant, dtype)
 
 
+def without_repetitions(found: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
+    """The same program without equations that repeat an earlier one, such as every further ``x[0]``."""
+    from jax.extend.core import ClosedJaxpr
+
+    def name(var: jex.Var | jex.Literal) -> Any:
+        if not is_literal(var):
+            return var
+        number = np.asarray(var.val)
+        return number.dtype, number.shape, number.tobytes()
+
+    results: dict[Any, Sequence[jex.Var]] = {}
+    names: dict[jex.Var, jex.Var] = {}
+    kept = []
+    for eqn in found.jaxpr.eqns:
+        operands = [var if is_literal(var) else names.get(var, var) for var in eqn.invars]
+        key: Any = eqn.primitive, tuple(map(name, operands)), tuple(sorted(eqn.params.items()))
+        try:
+            first = None if eqn.effects else results.setdefault(key, eqn.outvars)
+        except TypeError:  # a parameter that is not hashable
+            first = None
+        if first is None or first is eqn.outvars:
+            kept.append(eqn.replace(invars=operands))
+        else:
+            names |= dict(zip(eqn.outvars, first, strict=True))
+    outputs = [var if is_literal(var) else names.get(var, var) for var in found.jaxpr.outvars]
+    return ClosedJaxpr(found.jaxpr.replace(eqns=kept, outvars=outputs), found.consts)
+
+
 def inner(eqn: jex.JaxprEqn) -> list[jex.ClosedJaxpr]:
     """The jaxprs that an equation calls, except the jaxpr that combines two entries of a scatter."""
     found = []

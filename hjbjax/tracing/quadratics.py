@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from hjbjax.tracing import taylor_forms as tf
-from hjbjax.tracing.interpreter import Algebra, evaluate_jaxpr, lift
+from hjbjax.tracing.interpreter import Algebra, entry_by_entry, evaluate_jaxpr, lift
 from hjbjax.tracing.intervals import quietly
 from hjbjax.tracing.stacks import object_array
 from hjbjax.tracing.taylor_forms import SCALARS, Form
@@ -134,6 +134,17 @@ class _Polynomials(Algebra):
 
     def whole(self, eqn: jex.JaxprEqn, operands: list) -> None:
         SCALARS.whole(eqn, operands)
+
+    def call(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list | None:
+        if not tf.is_hypot(eqn, inner):
+            return None
+
+        def length(*pair: Polynomial) -> Polynomial:
+            if not all(each.keys() <= {()} for each in pair):
+                raise NotQuadraticError
+            return Polynomial({(): tf.norm([_constant_of(each) for each in pair])})
+
+        return [entry_by_entry(length, operands, self)]
 
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list:
         return evaluate_jaxpr(inner, operands, self)

@@ -17,20 +17,23 @@ not round.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import operator
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hjbjax.problem.pytree import as_partial, remembered
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Numbers
 from hjbjax.tracing import intervals as iv
-from hjbjax.tracing.interpreter import Algebra, evaluate_jaxpr, lift, pack
+from hjbjax.tracing.interpreter import Algebra, entry_by_entry, evaluate_jaxpr, lift, pack
 from hjbjax.tracing.intervals import Interval, entire, monotone, outward, point, power, squared, union
-from hjbjax.tracing.jaxprs import CALLS, CUMULATIVE, MOVES, REDUCTIONS, SCATTERS, array_type
+from hjbjax.tracing.jaxprs import CALLS, CUMULATIVE, MOVES, REDUCTIONS, SCATTERS, array_type, without_repetitions
 from hjbjax.tracing.stacks import varies
 
 if TYPE_CHECKING:
@@ -87,17 +90,41 @@ class Form:
 
     def bounds(self, radii: Sequence[np.ndarray]) -> Interval:
         """The range by Taylor's theorem of first and of second order, over boxes with these half widths."""
-        first = second = self.centre
-        sides = [Interval(-radius, radius) for radius in radii]
-        for slope, at_centre, side in zip(self.slopes, self.gradient, sides, strict=False):
-            if slope is not None:
-                first = first + slope * side
-            if at_centre is not None:
-                second = second + at_centre * side
+        first, second = _Distance(), _Distance()
+        for slope, at_centre, radius in zip(self.slopes, self.gradient, radii, strict=False):
+            for total, each in ((first, slope), (second, at_centre)):
+                if each is not None:
+                    total.add(each, radius)
         for (i, j), curvature in self.curvature.items():
-            half = Interval(np.zeros_like(radii[i]), (sides[i] * sides[i]).hi / 2)
-            second = second + curvature * (half if i == j else sides[i] * sides[j])
-        return iv.meet(iv.meet(first, second), self.range)
+            second.add(curvature, radii[i] * radii[j] / (2 if i == j else 1) + iv.TINY, rises=i == j)
+        return iv.meet(iv.meet(first.around(self.centre), second.around(self.centre)), self.range)
+
+
+class _Distance:
+    """Upper bounds of the distances below and above a number, as sums of products of numbers that are not negative."""
+
+    def __init__(self) -> None:
+        self.below: np.ndarray = np.zeros(())
+        self.above: np.ndarray = np.zeros(())
+        self.count = 0
+
+    def add(self, factor: Interval, size: np.ndarray, *, rises: bool = False) -> None:
+        """Add a factor times any number of at most this absolute value, or from zero to this value if it ``rises``."""
+        if rises:
+            below, above = (np.maximum(end, 0.0) * size for end in (-factor.lo, factor.hi))
+        else:
+            below = above = abs(factor).hi * size
+        if iv.have_nan(below, above):  # 0 · ∞ is 0, as in a product of intervals
+            below, above = (np.where(size == 0, 0.0, each) for each in (below, above))
+        self.below, self.above, self.count = self.below + below, self.above + above, self.count + 1
+
+    def around(self, centre: Interval) -> Interval:
+        """The numbers within these distances."""
+        error = (self.count + 4) * iv.EPS  # each product is rounded at most three times, and each sum once per term
+        return outward(
+            centre.lo - (self.below * (1 + error) + self.count * iv.TINY),
+            centre.hi + (self.above * (1 + error) + self.count * iv.TINY),
+        )
 
 
 def constant(value: object) -> Form:
@@ -115,8 +142,7 @@ def coordinates(boxes: Sequence[Interval], centres: Sequence[Interval], count: i
       count: the number of coordinates with respect to which to differentiate.
       first: the number of the first of these coordinates.
     """
-    one = point(1.0)
-    slopes = [tuple(one if i == first + k else None for i in range(count)) for k in range(len(boxes))]
+    slopes = [tuple(_ONE if i == first + k else None for i in range(count)) for k in range(len(boxes))]
     return [Form(box, centre, slope, slope) for box, centre, slope in zip(boxes, centres, slopes, strict=True)]
 
 
@@ -152,7 +178,7 @@ def _jaxpr(function: Callable, *lengths: int | None) -> jex.ClosedJaxpr:
     """The jaxpr for vectors of these lengths; None is a scalar."""
     with own_settings(x64=True):
         shapes = [jax.ShapeDtypeStruct(() if length is None else (length,), np.float64) for length in lengths]
-        return jax.make_jaxpr(function)(*shapes)
+        return without_repetitions(jax.make_jaxpr(function)(*shapes))
 
 
 # --- rules ---
@@ -194,7 +220,7 @@ def _bend(factors: Sequence[Interval], seconds: Curvature, operands: Sequence[Fo
             for j, right in enumerate(operands[b].slopes):
                 if left is not None and right is not None and (a != b or i <= j):
                     square = a == b and i == j
-                    term = second * (iv.squared(left) if square else left * right)
+                    term = (iv.squared(left) if square else left * right) * second
                     # with a ≠ b both ∂_i a ∂_j b and ∂_j a ∂_i b occur, on the diagonal of (i, j) twice
                     put(i, j, term.scaled(2.0) if a != b and i == j else term)
     return total
@@ -281,6 +307,37 @@ def maximum(left: Form, right: Form) -> Form:
     return apply(Interval.maximum, lambda a, b: _weights(a.lo >= b.hi, b.lo >= a.hi), _kink_of_two, left, right)
 
 
+def norm(b: Sequence[Form]) -> Form:
+    """The Euclidean norm. Where it may be zero, its derivative is the range over all directions."""
+
+    def function(*ranges: Interval) -> Interval:
+        total = squared(ranges[0])
+        for each in ranges[1:]:
+            total = total + squared(each)
+        return iv.square_root(Interval(np.maximum(total.lo, 0.0), total.hi))
+
+    def derivatives(*ranges: Interval) -> list[Interval]:
+        length = function(*ranges)
+        found = [each / length for each in ranges]
+        return [Interval(np.maximum(each.lo, -1.0), np.minimum(each.hi, 1.0)) for each in found]
+
+    def seconds(*ranges: Interval) -> Curvature:
+        length = function(*ranges)
+        cubed = power(length, 3)
+        found: Curvature = {}
+        for i, j in itertools.combinations_with_replacement(range(len(ranges)), 2):
+            found[i, j] = -(ranges[i] * ranges[j] / cubed)
+            if i == j:
+                others = point(0.0)
+                for k, other in enumerate(ranges):
+                    if k != i:
+                        others = others + squared(other)
+                found[i, j] = others / cubed
+        return found
+
+    return apply(function, derivatives, seconds, *b)
+
+
 def _weights(first: np.ndarray, second: np.ndarray) -> tuple[Interval, Interval]:
     """The derivatives with respect to two operands of which one is the result, in part or on both sides of a kink."""
     return Interval(np.where(first, 1.0, 0.0), np.where(second, 0.0, 1.0)), Interval(
@@ -313,7 +370,7 @@ def _reciprocal_root(x: Interval) -> Interval:
     return _ONE / iv.square_root(x)
 
 
-_ONE = point(1.0)
+_ONE = iv.ONE
 _LOG2 = iv.logarithm_of_two
 _NO_BEND = point(0.0)
 _exp, _sinh = monotone(np.exp, least=0.0), monotone(np.sinh)
@@ -623,12 +680,29 @@ class _Scalars(Algebra):
             if any(varies(value) for k, value in enumerate(operands) if k not in moved):
                 raise _refusal(f"{name} with an index that depends on the state")
 
+    def call(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list | None:
+        # its program divides by the larger number, which may be zero
+        return [entry_by_entry(lambda *pair: norm(pair), operands, self)] if is_hypot(eqn, inner) else None
+
     def custom_jvp(self, eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr, operands: list) -> list:
         # the derivatives are those of the computation: a rule of the user may differ
         return evaluate_jaxpr(inner, operands, self)
 
     def nodewise(self, eqn: jex.JaxprEqn, operands: list) -> list[np.ndarray]:
         raise _refusal(eqn.primitive.name)
+
+
+def is_hypot(eqn: jex.JaxprEqn, inner: jex.ClosedJaxpr) -> bool:
+    """True for a call of ``jnp.hypot``, whose name a function of the user may have too."""
+    return eqn.params.get("name") == "hypot" and str(inner.jaxpr) == _hypot(tuple(inner.in_avals))
+
+
+@functools.cache
+def _hypot(types: tuple[jax.core.ShapedArray, ...]) -> str:
+    """The program of ``jnp.hypot`` for operands of these types."""
+    with own_settings(x64=True):
+        (call,) = jax.make_jaxpr(jnp.hypot)(*types).jaxpr.eqns
+    return str(call.params["jaxpr"].jaxpr)
 
 
 def _refusal(name: str) -> ValueError:

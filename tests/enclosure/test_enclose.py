@@ -104,14 +104,53 @@ def test_a_spline_and_its_gradient_are_within_their_ranges_over_cells():
     here = spline.at(states).values(values)
     assert np.all(here.hi - here.lo < 1e-11)
     assert np.all((w.range.lo <= here.hi) & (here.lo <= w.range.hi))
-    assert np.all(here.lo <= spline.largest(values)[tuple(index)])
-    assert np.all(spline.largest(values)[tuple(index)] <= w.range.hi + 1e-11)
+    assert np.all(here.lo <= spline.range(values).hi[tuple(index)])
+    assert np.all(spline.range(values).lo[tuple(index)] <= here.hi)
+    other = draw.normal(size=grid.shape)
+    gap = spline.largest_difference(values, other, index)
+    assert np.all(here.lo - spline.at(states).values(other).hi <= gap)
+    np.testing.assert_allclose(gap, spline.range(values - other).hi[tuple(index)], rtol=1e-12, atol=1e-12)
+    assert np.all(spline.range(values).hi[tuple(index)] <= w.range.hi + 1e-11)
     for k in range(2):
         step = 1e-4 * np.eye(2)[k]
         # the spline is a parabola in each coordinate, so that a central difference is exact inside a cell
         ends = [spline.at(np.clip(states + side * step, grid.lo, grid.hi)).values(values).lo for side in (1, -1)]
         slope, exact = (ends[0] - ends[1]) / 2e-4, p[k].range
         assert np.all((exact.lo - 1e-2 <= slope) & (slope <= exact.hi + 1e-2))
+
+
+@pytest.mark.parametrize("controls", [hjb.Box([-2.0, -1.0], [2.0, 1.0]), hjb.Finite([[-1.0, 0.0], [1.0, 0.5]])])
+def test_a_list_of_cells_has_the_defects_of_all_cells(controls):
+    """Cells in a mesh share the functions of one coordinate; those in a list do not."""
+    draw = np.random.default_rng(1)
+    drift = lambda x, u: jnp.stack([jnp.sin(x[0]) * x[1] + u[0], jnp.cos(x[0]) * (1 + u[1])])  # noqa: E731
+    problem = hjb.Problem(drift, lambda x, u: x[0] ** 2 * jnp.exp(x[1]) + u @ u, controls, discount=0.5)
+    grid = hjb.Grid([-1.0, 0.0], [1.0, 2.0], (9, 12), periodic=(False, True))
+    spline, values = Spline.on(grid), draw.normal(size=grid.shape)
+    every = [each.ravel() for each in np.meshgrid(*map(np.arange, spline.shape), indexing="ij")]
+    with jax.enable_x64(True):
+        mesh = defect.blocks(problem, grid, spline, defect.all_cells(spline), 0)
+        whole = defect.defects(spline, mesh, values)
+        listed = defect.defects(spline, defect.blocks(problem, grid, spline, every, 0), values)
+        some = draw.random(spline.shape) < 0.3
+        part = defect.defects(spline, defect.chosen_cells(mesh, some), values)
+        policy = defect.policy(spline, mesh, values)
+    for name in ("low", "high", "policy"):
+        np.testing.assert_allclose(getattr(listed, name), getattr(whole, name), rtol=1e-12)
+        np.testing.assert_allclose(getattr(part, name)[some], getattr(whole, name)[some], rtol=1e-12)
+    np.testing.assert_allclose(policy, whole.policy, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_value_in_three_dimensions_is_enclosed_and_the_bounds_close_with_the_mesh():
+    value = lambda x: 0.3 * jnp.sum(jnp.cos(2 * jnp.pi * x)) + 0.2 * jnp.sin(2 * jnp.pi * (x[0] + x[1]))  # noqa: E731
+    drift = lambda x, u: 0.2 * jnp.sin(2 * jnp.pi * x[jnp.array([1, 2, 0])]) + u  # noqa: E731
+    problem, widths = manufactured(value, drift, in_box(2.0), hjb.Box([-2.0] * 3, [2.0] * 3)), []
+    for count in (12, 24):
+        grid = hjb.Grid([0.0] * 3, [1.0] * 3, (count,) * 3, periodic=(True,) * 3)
+        found = hjb.enclose(problem, near(grid, value), rounds=1)
+        widths.append(check(found, value, [0.0] * 3, [1.0] * 3))
+    assert widths[1] < 0.5 * widths[0]
 
 
 @pytest.mark.slow
@@ -238,9 +277,9 @@ def test_of_several_candidates_only_the_best_one_in_a_cell_must_be_a_bound():
         spline = Spline.on(grid)
         blocks = defect.blocks(problem, grid, spline, defect.all_cells(spline), 0)
         task = DiscountTask(problem, grid, spline, blocks, 1e-3, np.ones(grid.shape, bool))
-        found = [task.defects(each) for each in sides]
-        needs = branches.required(task, sides, found, -1)
-        alone = [float(np.max(-each.low)) for each in found]
+        leads = [np.where(branches.is_beaten(task, sides, i, -1), 0.0, np.inf) for i in range(2)]
+        needs, _ = branches.required(task, sides, leads, -1, 0.0)
+        alone = [float(np.max(-task.defects(each).low)) for each in sides]
     assert min(alone) > 0.3
     assert np.max(needs) < 0.025  # next to ±1, where the cost has a kink
 
@@ -327,7 +366,7 @@ def test_values_whose_sums_may_overflow_are_refused():
     with pytest.raises(ValueError, match="above 1e"):
         hjb.enclose(problem, hjb.Solution(grid, values, None, code=hjb.Status.CONVERGED))
     spline = Spline.on(grid)
-    assert np.all(np.isinf(spline.largest(values)))
+    assert np.all(np.isinf(spline.range(values).hi))
     assert np.all(np.isinf(spline.at(np.zeros((1, 1))).values(values).lo))
 
 

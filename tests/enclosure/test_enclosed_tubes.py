@@ -74,6 +74,17 @@ def test_a_nonlinear_drift_is_enclosed_at_another_level():
     assert interval(found, -end, end) < 0.3
 
 
+def test_a_level_outside_the_range_of_the_value_has_an_empty_tube():
+    """σ was −1.8e308, which overflowed."""
+    problem = hjb.reach(lambda x, u: u, UNIT, size)
+    solution = marched(problem, hjb.Grid([-2.0], [2.0], (41,)), 0.5, 11)
+    found = hjb.enclose_tube(problem, solution, level=-3.0)
+    assert np.all(np.isnan(found.inner))
+    assert np.all((found.outer > 0) & (found.outer < 100))
+    assert not found.outer_at(np.linspace(-2, 2, 50)[:, None]).any()
+    assert "the inner set is empty" in found.message
+
+
 def test_a_moving_target_is_enclosed():
     """l = |x − 0.3 t| − ½ at unit speed: the tube runs from −½ − 0.7 T to ½ + 1.3 T."""
     problem = hjb.reach(lambda t, x, u: u, UNIT, lambda t, x: jnp.abs(x[0] - 0.3 * t) - 0.5, time_dependent=True)
@@ -204,8 +215,8 @@ def test_the_hulls_of_the_coefficients_contain_the_spline():
     grid = hjb.Grid([0.0, 0.0], [2.0, 1.0], (7, 8), periodic=(False, True), stretch=(hjb.Sinh(2.0, 0.4), None))
     values, spline = draw.normal(size=grid.shape), Spline.on(grid)
     least, most = hulls(values, grid)
-    assert np.all(most >= spline.largest(values) - 1e-11)
-    assert np.all(least <= 1e-11 - spline.largest(-values))
+    assert np.all(most >= spline.range(values).hi - 1e-11)
+    assert np.all(least <= 1e-11 + spline.range(values).lo)
 
 
 def test_the_hulls_contain_the_spline_at_corners():

@@ -1,5 +1,6 @@
 """Files and pictures of an enclosure, and the region in which narrow bounds are wanted."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from pictures import pictures as plotting
@@ -50,6 +51,60 @@ def _foreign(folder):
     path = folder / "solution.npz"
     near(hjb.Grid([0.0], [1.0], (3,)), lambda x: x[..., 0]).save(path)
     return path
+
+
+@pytest.fixture(scope="module")
+def tubes():
+    """A tube with a free boundary, one with an empty inner set, and one to be avoided on a periodic axis."""
+    unit, grid = (
+        hjb.Box([-1.0], [1.0]),
+        hjb.Grid([-2.0], [2.0], (41,), names=("position",), stretch=(hjb.Sinh(2.0, 0.4),)),
+    )
+    reach = hjb.reach(lambda x, u: u, unit, lambda x: jnp.abs(x[0]) - 0.5)
+    moves = lambda x, u: jnp.stack([jnp.cos(x[1]), u[0]])  # noqa: E731
+    avoid = hjb.avoid(moves, unit, lambda x: jnp.abs(x[0]) - 0.5)
+    torus = hjb.Grid([-2.0, -np.pi], [2.0, np.pi], (17, 12), periodic=(False, True))
+    found = [
+        (problem, hjb.march(problem, each, 0.5, times=np.linspace(0, 0.5, count)))
+        for problem, each, count in ((reach, grid, 11), (avoid, torus, 6))
+    ]
+    return [hjb.enclose_tube(*found[0]), hjb.enclose_tube(*found[0], level=-3.0), hjb.enclose_tube(*found[1])]
+
+
+def test_a_tube_is_read_from_its_file_bit_by_bit(tubes, tmp_path):
+    for k, each in enumerate(tubes):
+        path = tmp_path / f"{k}.npz"
+        each.save(path)
+        again = hjb.TubeEnclosure.load(path)
+        states = np.random.default_rng(0).uniform(each.grid.lo, each.grid.hi, (500, each.grid.ndim))
+        for name in ("inner", "outer", "shifts", "thresholds"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(each, name))
+        np.testing.assert_array_equal(again.inner_at(states), each.inner_at(states))
+        np.testing.assert_array_equal(again.outer_at(states), each.outer_at(states))
+        assert repr(again) == repr(each)
+        assert repr(again.grid) == repr(each.grid)
+        for name in ("level", "is_free", "message", "stats", "above"):
+            assert getattr(again, name) == getattr(each, name)
+    with pytest.raises(FileError, match="another program"):
+        hjb.TubeEnclosure.load(_foreign(tmp_path))
+
+
+def test_the_picture_of_a_tube_has_both_sets(tubes):
+    inner, outer, _, between = plotting.enclosure(tubes[0])
+    np.testing.assert_array_equal(inner.get_ydata(), tubes[0].inner)
+    np.testing.assert_array_equal(outer.get_ydata(), tubes[0].outer)
+    assert inner.axes.get_xlabel() == "position"
+    (x,) = [each[:, 0] for each in (np.concatenate([path.vertices for path in between.get_paths()]),)]
+    unproved = tubes[0].outer_at(x[:, None]) & ~tubes[0].inner_at(x[:, None])
+    assert np.mean(unproved) > 0.9  # the ends of the areas may be a little outside
+    assert len(plotting.enclosure(tubes[1])) == 4
+    inner, outer, area = plotting.enclosure(tubes[2])
+    for line, function in ((inner, tubes[2].inner_at), (outer, tubes[2].outer_at)):
+        points = np.concatenate([path.vertices for path in line.get_paths()])
+        near = points[np.abs(points[:, 0]) < 1.9]
+        spread = [function(near + side * np.array([0.2, 0.0])) for side in (-1, 1)]
+        assert np.all(spread[0] != spread[1])
+    assert len(area.get_paths()) > 0
 
 
 def test_the_largest_required_shift_is_that_of_the_first_candidate(found):

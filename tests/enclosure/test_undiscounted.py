@@ -193,3 +193,31 @@ def test_a_cost_that_may_vanish_outside_the_target_is_refused():
         )
         with pytest.raises(ValueError, match=word):
             hjb.enclose(problem, solution_of(line, near))
+
+
+@pytest.mark.parametrize(
+    ("target", "word"),
+    [
+        (lambda x: jnp.nan * x[0], "is NaN at x = "),
+        (lambda x: jnp.sqrt(x[0] - 0.5), r"is NaN at x = \[-1.0\]"),
+        (lambda x: x, r"returned shape \(1,\)"),
+        (lambda x: jnp.stack([x[0], x[0]]), r"returned shape \(2,\)"),
+        (lambda x: 1.0, "no cell of the grid meets the target"),
+        (lambda x: jnp.asarray(-1.0), "every cell of the grid is inside the target"),
+    ],
+)
+def test_a_target_without_numbers_or_states_is_refused(target, word):
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: 1.0, hjb.Box([-1.0], [1.0]), target=target)
+    with pytest.raises(ValueError, match=word):
+        hjb.enclose(problem, solution_of(hjb.Grid([-1.0], [1.0], (21,)), lambda x: np.abs(x[:, 0])))
+
+
+def test_a_target_may_use_hypot():
+    """The program of jnp.hypot divides by a number that is zero at the origin: the upper bound was infinite."""
+    _, value = disc()
+    grid, widths = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (21, 21)), []
+    for target in (lambda x: jnp.hypot(x[0] - 0.02, x[1]) - 0.25, disc()[0].target):
+        problem = hjb.Problem(lambda x, u: u, lambda x, u: 1.0, hjb.Ball(1.0, 2), target=target)
+        found = hjb.enclose(problem, solution_of(grid, value), rounds=1)
+        widths.append(np.median(check(found, value, [-1.0, -1.0], [1.0, 1.0])))
+    assert widths[0] <= 1.01 * widths[1]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hjbjax.tracing import quadratics
 from hjbjax.tracing import taylor_forms as tf
 from hjbjax.tracing.intervals import Interval, quietly
-from hjbjax.tracing.jaxprs import ENTRYWISE
+from hjbjax.tracing.jaxprs import ENTRYWISE, without_repetitions
 
 BOXES, POINTS = 10, 2
 lax, mp = jax.lax, mpmath.mp
@@ -219,6 +219,44 @@ def test_the_range_of_terms_that_cancel_falls_with_the_third_power_of_the_width(
 def test_a_primitive_without_a_rule_is_refused_by_name(function, name):
     with pytest.raises(ValueError, match=f"uses {name}, for which there is no interval rule"):
         bounds_of(function, *boxes_in(np.random.default_rng(0), -1, 1))
+
+
+def test_hypot_is_in_its_range_also_at_the_origin():
+    """Its program divides by the larger number, which is zero at the origin: the range was infinite."""
+    draw = np.random.default_rng(2)
+    low, high, middle, radii = boxes_in(draw, -1, 1)
+    low[:2], high[:2], middle[:2], radii[:2] = -0.1, 0.2, 0.05, 0.15 * (1 + 1e-12)
+    least, most = bounds_of(lambda x: jnp.hypot(x[0], x[1]), low, high, middle, radii)
+    for _ in range(50):
+        x = low + draw.random(low.shape) * (high - low)
+        found = np.sqrt(x[:, 0] ** 2 + x[:, 1] ** 2)
+        assert np.all((least - 1e-14 <= found) & (found <= most + 1e-14))
+    assert np.all(most[:2] < 0.36)
+
+
+def test_a_function_of_the_same_name_as_hypot_has_its_own_range():
+    @jax.jit
+    def hypot(a, b):
+        return a + 2 * b
+
+    low, high, middle, radii = boxes_in(np.random.default_rng(2), -1, 1)
+    least, most = bounds_of(lambda x: hypot(x[0], x[1]), low, high, middle, radii)
+    np.testing.assert_allclose(least, low[:, 0] + 2 * low[:, 1], atol=1e-12)
+    np.testing.assert_allclose(most, high[:, 0] + 2 * high[:, 1], atol=1e-12)
+
+
+def test_repeated_equations_are_evaluated_once():
+    def function(x):
+        return jnp.stack([jnp.sin(x[0]) * x[1], jnp.sin(x[0]) + x[1], 2.0 * x[0], 3.0 * x[0]])
+
+    closed = jax.make_jaxpr(function)(jnp.ones(2))
+    short = without_repetitions(closed)
+    names = [[eqn.primitive.name for eqn in each.jaxpr.eqns] for each in (closed, short)]
+    assert [each.count("sin") for each in names] == [2, 1]
+    assert [each.count("mul") for each in names] == [3, 3]
+    x = jnp.array([0.3, -0.7])
+    (found,) = jax.core.eval_jaxpr(short.jaxpr, short.consts, x)
+    np.testing.assert_array_equal(found, function(x))
 
 
 def branches(x):

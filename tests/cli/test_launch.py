@@ -122,6 +122,19 @@ def test_a_checkpoint_that_another_run_is_using_is_found_before_a_process_starts
 
 
 @pytest.mark.usefixtures("_no_child")
+@pytest.mark.parametrize("damage", [lambda data: data[:-100], lambda data: data[:600] + b"\0" + data[601:]])
+def test_a_damaged_checkpoint_is_found_before_a_process_starts(damage, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    grid = hjb.Grid([-1.0], [1.0], (9,))
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+    hjb.solve(problem, grid, scheme=hjb.Upwind(), tol=1e-2, checkpoint="run.npz")
+    damaged = damage((tmp_path / "run.npz").read_bytes())
+    (tmp_path / "run.npz").write_bytes(damaged)
+    refused(("launch", "--", "solve", "pendulum", "--resume", "--checkpoint", "run"), "run.npz: cannot be read: ", 5)
+    assert (tmp_path / "run.npz").read_bytes() == damaged
+
+
+@pytest.mark.usefixtures("_no_child")
 def test_more_nodes_than_indices_are_found_before_a_process_starts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(("launch", "--", "solve", "pendulum", "--shape", "100000x100000"), "10,000,000,000 nodes", 6)

@@ -16,7 +16,7 @@ import hashlib
 import sys
 import sysconfig
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +43,7 @@ def digest_of(thing: object) -> str:
 
 def digest_of_program(closed: jex.ClosedJaxpr) -> str:
     """A digest of the operations and constants of a jaxpr, of its host functions, and of its derivative rules."""
-    return _hash(_of_program(closed, {}))
+    return _hash(_of_program(closed.jaxpr, closed.consts, {}))
 
 
 def _hash(description: Any) -> str:
@@ -65,10 +65,9 @@ def _described(thing: Any, known: dict[int, tuple[int, Any]]) -> Any:
     if isinstance(thing, (np.ndarray, np.generic, jax.Array)):
         return _of_array(np.asarray(thing), known)
     if jaxprs.is_closed(thing):
-        return _of_program(thing, known)
+        return _of_program(thing.jaxpr, thing.consts, known)
     if jaxprs.is_open_jaxpr(thing):  # its constants are stored elsewhere, and described there
-        variables = [*thing.constvars, *thing.invars]
-        return _of_program(jaxprs.closed(thing.replace(constvars=[], invars=variables, debug_info=None)), known)
+        return _of_program(thing, (), known)
     if isinstance(thing, jax.tree_util.PyTreeDef):  # printing it omits the data of the functions in it
         return "tree", [_described(each, known) for each in (thing.node_data(), thing.children())]
     if isinstance(thing, (tuple, list, dict)):
@@ -133,23 +132,29 @@ def _kept_by_pickle(thing: Any) -> Any:
         return None
 
 
-def _of_program(closed: jex.ClosedJaxpr, known: dict[int, tuple[int, Any]], orders: int = ORDERS) -> Any:
+def _of_program(
+    jaxpr: jex.Jaxpr, consts: Sequence[Any], known: dict[int, tuple[int, Any]], orders: int = ORDERS
+) -> Any:
     """The description of a jaxpr, and of its derivatives up to an order if it has custom rules for them."""
-    (numbers, *called), whole = fingerprint(closed.jaxpr, closed.consts)
+    (numbers, *called), whole = fingerprint(jaxpr, consts)
     found = "program", numbers, [_described(each, known) for each in called]
     if whole or orders == 0:
         return found
-    slopes = [_traced(each, closed) for each in (_pullback, _pushforward)]  # a rule may have only one of them
-    return *found, [each and _of_program(each, known, orders - 1) for each in slopes]
+    slopes = [_traced(each, jaxpr) for each in (_pullback, _pushforward)]  # a rule may have only one of them
+    return *found, [each and _of_program(each.jaxpr, each.consts, known, orders - 1) for each in slopes]
 
 
-def _traced(derivative: Callable, closed: jex.ClosedJaxpr) -> jex.ClosedJaxpr | None:
+def _traced(derivative: Callable, jaxpr: jex.Jaxpr) -> jex.ClosedJaxpr | None:
     """The program of a derivative of a jaxpr; None if there is none."""
-    from jax.extend.core import jaxpr_as_fun
+    count = len(jaxpr.constvars)
 
-    shapes = [jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type) for each in closed.in_avals]
+    def function(*numbers: Any) -> list[Any]:
+        return jax.core.eval_jaxpr(jaxpr, numbers[:count], *numbers[count:])
+
+    avals = [jaxprs.array_type(var) for var in (*jaxpr.constvars, *jaxpr.invars)]
+    shapes = [jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type) for each in avals]
     try:
-        return jax.make_jaxpr(functools.partial(derivative, jaxpr_as_fun(closed)))(*shapes)
+        return jax.make_jaxpr(functools.partial(derivative, function))(*shapes)
     except Exception:  # any type, from rules of others
         return None
 

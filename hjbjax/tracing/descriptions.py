@@ -26,7 +26,7 @@ import numpy as np
 
 from hjbjax.problem.pytree import is_traced
 from hjbjax.tracing import jaxprs
-from hjbjax.tracing.outside import ADDRESS, ByCode, content, fingerprint, is_of_library, names_read
+from hjbjax.tracing.outside import ADDRESS, ByCode, bits_of, content, fingerprint, is_of_library, names_read
 
 if TYPE_CHECKING:
     from jax.extend import core as jex
@@ -63,7 +63,7 @@ def _described(thing: Any, known: dict[int, tuple[int, Any]]) -> Any:
     if is_traced(thing) and isinstance(thing, jax.Array):  # the host cannot read it, but may use its shape
         return "traced", str(thing.aval)
     if isinstance(thing, (np.ndarray, np.generic, jax.Array)):
-        return _of_array(np.asarray(thing), known)
+        return _of_array(*bits_of(thing), known)
     if jaxprs.is_closed(thing):
         return _of_program(thing.jaxpr, thing.consts, known)
     if jaxprs.is_open_jaxpr(thing):  # its constants are stored elsewhere, and described there
@@ -91,11 +91,11 @@ def _described(thing: Any, known: dict[int, tuple[int, Any]]) -> Any:
     return _of_object(thing, known)
 
 
-def _of_array(array: np.ndarray, known: dict[int, tuple[int, Any]]) -> Any:
-    """The description of an array."""
+def _of_array(array: np.ndarray, dtype: Any, known: dict[int, tuple[int, Any]]) -> Any:
+    """The description of an array, whose dtype is another one if it is the data of random keys."""
     if array.dtype.hasobject:
         return "array", array.shape, [_described(each, known) for each in array.ravel().tolist()]
-    return "array", str(array.dtype), array.shape, hashlib.blake2b(array.tobytes(), digest_size=16).hexdigest()
+    return "array", str(dtype), array.shape, hashlib.blake2b(array.tobytes(), digest_size=16).hexdigest()
 
 
 def _read_by(function: types.FunctionType) -> tuple[Any, ...]:

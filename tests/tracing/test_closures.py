@@ -754,6 +754,29 @@ def test_a_digest_contains_the_derivative_rules_of_functions(ruled):
     assert digest(1.0) != digest(2.0)
 
 
+@pytest.mark.slow
+def test_a_cost_may_close_over_random_keys():
+    """The value is that of the numbers that the keys draw."""
+    typed, old = jax.random.split(jax.random.key(5), 3), jax.random.split(jax.random.PRNGKey(5), 3)
+    one = jax.random.key(0)
+    wanted = value(steer, lambda x, u: x @ x + jax.random.uniform(jax.random.PRNGKey(0)))
+    np.testing.assert_allclose(value(steer, lambda x, u: x @ x + jax.random.uniform(one)), wanted, atol=1e-12)
+    wanted = value(steer, lambda x, u: x @ x + jax.random.uniform(old[1]))
+    np.testing.assert_allclose(value(steer, lambda x, u: x @ x + jax.random.uniform(typed[1])), wanted, atol=1e-12)
+    inside = jax.jit(lambda a: value(lambda x, u: a * u, lambda x, u: x @ x + jax.random.uniform(typed[1])))(1.0)
+    np.testing.assert_allclose(inside, wanted, atol=1e-5)
+
+
+def test_a_digest_contains_random_keys():
+    def digest(seed):
+        key = jax.random.key(seed)
+        problem = hjb.Problem(steer, lambda x, u: x @ x + jax.random.uniform(key), UNIT, discount=1.0)
+        return closures.digest(closures.settled(problem, 1), 1), digest_of(lambda x: jax.random.uniform(key, x.shape))
+
+    assert digest(0) == digest(0)
+    assert not set(digest(0)) & set(digest(1))
+
+
 @pytest.mark.parametrize("function", [lambda x: x + 1, lambda x: x @ x])
 def test_a_digest_contains_the_functions_in_the_structure_of_a_tree(function):
     """Printing a structure shows the addresses of its functions, and not their data."""

@@ -93,7 +93,7 @@ def digest(problem: Problem, n: int) -> str:
                 shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in _shapes(problem, name, n)]
                 _, closed = _trace(_bare(function), shapes)
                 if closed is not None:  # a function that cannot be traced is refused by the checks
-                    account.update(descriptions.digest_of_program(closed).encode())
+                    account.update(descriptions.digest_of_jaxpr(closed).encode())
         sets = (problem.controls, problem.disturbances)
         # the structure of a set holds its kind, its dimension, and whether the sum of a simplex may be smaller
         kinds = [type(each) if callable(each) else jax.tree.structure(each) for each in sets]
@@ -105,7 +105,7 @@ def digest(problem: Problem, n: int) -> str:
 
 def digest_of_program(function: Callable, *arguments: Any) -> str:
     """A digest of the operations and constants of a function of arrays, the same in every process."""
-    return descriptions.digest_of_program(jax.make_jaxpr(function)(*arguments))
+    return descriptions.digest_of_jaxpr(jax.make_jaxpr(function)(*arguments))
 
 
 def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:

@@ -41,7 +41,7 @@ def digest_of(thing: object) -> str:
     return _hash(_described(thing, {}))
 
 
-def digest_of_program(closed: jex.ClosedJaxpr) -> str:
+def digest_of_jaxpr(closed: jex.ClosedJaxpr) -> str:
     """A digest of the operations and constants of a jaxpr, of its host functions, and of its derivative rules."""
     return _hash(_of_program(closed.jaxpr, closed.consts, {}))
 

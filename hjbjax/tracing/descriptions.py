@@ -127,9 +127,10 @@ def _of_object(thing: Any, known: dict[int, tuple[int, Any]]) -> Any:
 def _kept_by_pickle(thing: Any) -> Any:
     """The data from which a copy is made: without caches, also of an object written in C; None if unknown."""
     try:
-        return thing.__reduce__()
+        found = thing.__reduce__()
     except Exception:  # any type, from code of others
         return None
+    return found if isinstance(found, tuple) else None  # otherwise a name, as of a function with ``lru_cache``
 
 
 def _of_program(

@@ -692,6 +692,8 @@ HELD = {
     "table": (lambda: interpolated(TABLE), lambda: interpolated(NEARLY)),
     "partial": (lambda: functools.partial(weighted, gain=1.0), lambda: functools.partial(weighted, gain=2.0)),
     "nested": (lambda: times_gain({"a": [Gain(TABLE)]}), lambda: times_gain({"a": [Gain(NEARLY)]})),
+    "cached": (lambda: functools.lru_cache(times_gain(1.0)), lambda: functools.lru_cache(times_gain(2.0))),
+    "compiled": (lambda: jax.jit(lambda x: 1.0 * x), lambda: jax.jit(lambda x: 2.0 * x)),
     "spline": (lambda: CubicSpline(TABLE, TABLE), lambda: CubicSpline(TABLE, NEARLY)),
 }
 

@@ -209,13 +209,14 @@ def _check_parts(problem: "Problem", grid: "Grid", devices: tuple[int, ...], sch
 
 
 def _try_checkpoint(checkpoint: Path) -> None:
-    """Raise OSError if a checkpoint cannot be written, or if another run is using it."""
-    from hjbjax.solution import files, placement
+    """Raise OSError if a checkpoint cannot be read or written, or if another run is using it."""
+    from hjbjax.solution import checkpoints, files, placement
     from hjbjax.solution.locked_file import LockedFile
 
     path = placement.absolute(files.with_suffix(os.fspath(checkpoint)))
     with contextlib.closing(LockedFile(path)) as file:
-        file.take()
+        if file.take():
+            checkpoints.check_file(path)
     with placement.new_file(path):
         pass
 

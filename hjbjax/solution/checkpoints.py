@@ -469,6 +469,11 @@ def _read(path: str, question: Mapping[str, str]) -> dict[str, list[Record]]:
     return files.read(path, FORMAT, VERSION, _plan, rebuild)
 
 
+def check_file(path: str) -> None:
+    """Raise FileError if a file is not an undamaged checkpoint; the problem is not compared."""
+    files.read(path, FORMAT, VERSION, _plan, lambda header, arrays: None)
+
+
 def _difference(question: Mapping[str, str], made_for: Mapping[str, str]) -> str:
     """The difference between two questions in words; empty if there is none."""
     if question.keys() != made_for.keys():

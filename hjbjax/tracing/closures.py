@@ -33,8 +33,7 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.spaces import is_space
 from hjbjax.problem.state_bounds import with_any_control
 from hjbjax.problem.types import DType, Numbers
-from hjbjax.tracing import host_functions, jaxprs
-from hjbjax.tracing.descriptions import digest_of
+from hjbjax.tracing import descriptions, host_functions, jaxprs
 from hjbjax.tracing.outside import (
     FLOATS,
     NUMBERS,
@@ -94,7 +93,7 @@ def digest(problem: Problem, n: int) -> str:
                 shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in _shapes(problem, name, n)]
                 _, closed = _trace(_bare(function), shapes)
                 if closed is not None:  # a function that cannot be traced is refused by the checks
-                    account.update(_text_of_program(closed).encode())
+                    account.update(descriptions.digest_of_jaxpr(closed).encode())
         sets = (problem.controls, problem.disturbances)
         # the structure of a set holds its kind, its dimension, and whether the sum of a simplex may be smaller
         kinds = [type(each) if callable(each) else jax.tree.structure(each) for each in sets]
@@ -106,13 +105,7 @@ def digest(problem: Problem, n: int) -> str:
 
 def digest_of_program(function: Callable, *arguments: Any) -> str:
     """A digest of the operations and constants of a function of arrays, the same in every process."""
-    closed = jax.make_jaxpr(function)(*arguments)
-    return hashlib.blake2b(_text_of_program(closed).encode(), digest_size=16).hexdigest()
-
-
-def _text_of_program(closed: jex.ClosedJaxpr) -> str:
-    (numbers, *called), _ = fingerprint(closed.jaxpr, closed.consts)
-    return repr((numbers, *map(digest_of, called)))
+    return descriptions.digest_of_jaxpr(jax.make_jaxpr(function)(*arguments))
 
 
 def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:

@@ -142,7 +142,8 @@ def _count_whole(outside: Sequence[jex.Var | jex.Literal], inside: Sequence[jex.
 def _index_array(value: Numbers) -> np.ndarray | None:
     """A concrete array of indices as NumPy; ``None`` for anything else."""
     kind = getattr(value, "dtype", np.asarray(value).dtype if isinstance(value, (bool, int)) else None)
-    if kind is None or np.dtype(kind).kind not in "iub" or np.size(value) > MOST:
+    whole = kind is not None and any(jax.dtypes.issubdtype(kind, each) for each in (np.integer, np.bool_))
+    if not whole or np.size(value) > MOST:
         return None
     try:
         return np.asarray(value)

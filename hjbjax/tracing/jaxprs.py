@@ -101,6 +101,8 @@ CALLS |= {"checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr", "custom_jv
 def in_numpy(eqn: jex.JaxprEqn, operands: Sequence[Numbers]) -> np.ndarray | None:
     """Result of an equation on concrete numbers if NumPy gives the same bits, else None."""
     name, dtypes = eqn.primitive.name, [array_type(var).dtype for var in (*eqn.invars, *eqn.outvars)]
+    if any(jax.dtypes.issubdtype(d, jax.dtypes.extended) for d in dtypes):  # random keys
+        return None
     if name not in IN_NUMPY and (name not in _ARITHMETIC or not all(np.issubdtype(d, np.floating) for d in dtypes)):
         return None
     arrays = [np.asarray(operand, dtype) for operand, dtype in zip(operands, dtypes[:-1], strict=True)]

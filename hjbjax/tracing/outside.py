@@ -202,12 +202,22 @@ class _Account:
             self._tell(ADDRESS.sub("", repr(value)))
 
     def _number(self, value: Numbers) -> None:
-        array = np.asarray(value)  # the bits, because printing rounds numbers and abridges long arrays
-        self._tell(array.dtype, array.shape)
+        array, kind = bits_of(value)  # because printing rounds numbers and abridges long arrays
+        self._tell(kind, array.shape)
         self.digest.update(array.tobytes())
 
     def _tell(self, *words: Any) -> None:
         self.digest.update(repr(words).encode())
+
+
+def bits_of(value: Any) -> tuple[np.ndarray, Any]:
+    """An array in NumPy, and its dtype; for random keys their data, which NumPy has no type for."""
+    dtype = getattr(value, "dtype", None)
+    if dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key):
+        with jax.core.eval_context():  # outside of the caller's ``jit``
+            return np.asarray(jax.random.key_data(value)), str(dtype)
+    array = np.asarray(value)
+    return array, array.dtype
 
 
 def _is_rule_of_jax(parameters: dict[str, Any]) -> bool:
@@ -409,7 +419,7 @@ def content(cell: types.CellType) -> object:
 def _is_number(thing: object, kinds: tuple[type, ...]) -> bool:
     """True for a number of these kinds, and for a known array of real numbers."""
     if isinstance(thing, (np.ndarray, jax.Array)):
-        return not is_traced(thing) and np.issubdtype(thing.dtype, np.floating)
+        return not is_traced(thing) and jax.dtypes.issubdtype(thing.dtype, np.floating)
     return isinstance(thing, kinds) and not isinstance(thing, bool)
 
 

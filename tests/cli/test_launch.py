@@ -121,6 +121,23 @@ def test_a_checkpoint_that_another_run_is_using_is_found_before_a_process_starts
         refused(("launch", "--", "solve", "pendulum", "--resume", "--checkpoint", "run"), "another run is using it", 5)
 
 
+def leave_checkpoint(path):
+    """Write the checkpoint of a small solve."""
+    problem = hjb.Problem(lambda x, u: u, lambda x, u: x @ x, hjb.Box([-1.0], [1.0]), discount=1.0)
+    hjb.solve(problem, hjb.Grid([-1.0], [1.0], (9,)), scheme=hjb.Upwind(), tol=1e-2, checkpoint=path)
+
+
+@pytest.mark.usefixtures("_no_child")
+@pytest.mark.parametrize("damage", [lambda data: data[:-100], lambda data: data[:600] + b"\0" + data[601:]])
+def test_a_damaged_checkpoint_is_found_before_a_process_starts(damage, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    leave_checkpoint("run.npz")
+    damaged = damage((tmp_path / "run.npz").read_bytes())
+    (tmp_path / "run.npz").write_bytes(damaged)
+    refused(("launch", "--", "solve", "pendulum", "--resume", "--checkpoint", "run"), "run.npz: cannot be read: ", 5)
+    assert (tmp_path / "run.npz").read_bytes() == damaged
+
+
 @pytest.mark.usefixtures("_no_child")
 def test_more_nodes_than_indices_are_found_before_a_process_starts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -145,7 +162,7 @@ def test_a_launch_in_a_folder_that_is_allowed_starts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pendulum").mkdir()
     (tmp_path / "pendulum" / "value.png").touch()
-    (tmp_path / "run.npz").write_bytes(b"of an earlier run")
+    leave_checkpoint("run.npz")
     monkeypatch.setattr(children, "run_children", lambda *_, **__: ChildEnds((End(0, 0), End(1, 0))))
     for more in (("--force", "--checkpoint", "run", "--resume"), ("--dry-run",)):
         assert CliRunner().invoke(main, ["launch", "--", "solve", "pendulum", *more]).exit_code == 0

@@ -3,6 +3,7 @@
 import copy
 import functools
 import pickle
+import types
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from scipy.interpolate import CubicSpline
 import hjbjax as hjb
 from hjbjax.discretisation import posing
 from hjbjax.tracing import closures
+from hjbjax.tracing.descriptions import digest_of
 from hjbjax.tracing.outside import fingerprint, identity, unnested
 from tests.support.compilation import compiling
 
@@ -747,6 +749,8 @@ HELD = {
     "table": (lambda: interpolated(TABLE), lambda: interpolated(NEARLY)),
     "partial": (lambda: functools.partial(weighted, gain=1.0), lambda: functools.partial(weighted, gain=2.0)),
     "nested": (lambda: times_gain({"a": [Gain(TABLE)]}), lambda: times_gain({"a": [Gain(NEARLY)]})),
+    "cached": (lambda: functools.lru_cache(times_gain(1.0)), lambda: functools.lru_cache(times_gain(2.0))),
+    "compiled": (lambda: jax.jit(lambda x: 1.0 * x), lambda: jax.jit(lambda x: 2.0 * x)),
     "spline": (lambda: CubicSpline(TABLE, TABLE), lambda: CubicSpline(TABLE, NEARLY)),
 }
 
@@ -772,6 +776,93 @@ def test_a_digest_contains_the_globals_of_a_host_function(monkeypatch):
     first = digest_with(read_through_a_global)
     monkeypatch.setitem(SHARED, "gain", 2.0)
     assert digest_with(read_through_a_global) != first
+
+
+def with_forward_rule(slope):
+    same = jax.custom_jvp(lambda u: u)
+    same.defjvp(lambda primals, tangents: (same(primals[0]), slope * tangents[0]))
+    return same
+
+
+def with_reverse_rule(slope):
+    same = jax.custom_vjp(lambda u: u)
+    same.defvjp(lambda u: (same(u), None), lambda _, weights: (slope * weights,))
+    return same
+
+
+def with_second_rule(slope):
+    """A function whose first derivative has a rule."""
+    once = jax.custom_jvp(lambda tangent: tangent)
+    once.defjvp(lambda primals, tangents: (once(primals[0]), slope * tangents[0]))
+    same = jax.custom_jvp(lambda u: u)
+    same.defjvp(lambda primals, tangents: (same(primals[0]), once(primals[0]) * tangents[0]))
+    return same
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ruled", [with_forward_rule, with_reverse_rule, with_second_rule])
+def test_a_digest_contains_the_derivative_rules_of_functions(ruled):
+    """A training follows the rules, so a run with other rules would continue the weights of another training."""
+
+    def digest(slope):
+        same = ruled(slope)
+        problem = hjb.Problem(lambda x, u: same(u), square, UNIT, discount=1.0)
+        return closures.digest(closures.settled(problem, 1), 1)
+
+    assert digest(1.0) == digest(1.0)
+    assert digest(1.0) != digest(2.0)
+
+
+@pytest.mark.slow
+def test_a_cost_may_close_over_random_keys():
+    """The value is that of the numbers that the keys draw."""
+    typed, old = jax.random.split(jax.random.key(5), 3), jax.random.split(jax.random.PRNGKey(5), 3)
+    one = jax.random.key(0)
+    wanted = value(steer, lambda x, u: x @ x + jax.random.uniform(jax.random.PRNGKey(0)))
+    np.testing.assert_allclose(value(steer, lambda x, u: x @ x + jax.random.uniform(one)), wanted, atol=1e-12)
+    wanted = value(steer, lambda x, u: x @ x + jax.random.uniform(old[1]))
+    np.testing.assert_allclose(value(steer, lambda x, u: x @ x + jax.random.uniform(typed[1])), wanted, atol=1e-12)
+    inside = jax.jit(lambda a: value(lambda x, u: a * u, lambda x, u: x @ x + jax.random.uniform(typed[1])))(1.0)
+    np.testing.assert_allclose(inside, wanted, atol=1e-5)
+
+
+def test_a_digest_contains_random_keys():
+    def digest(seed):
+        key = jax.random.key(seed)
+        problem = hjb.Problem(steer, lambda x, u: x @ x + jax.random.uniform(key), UNIT, discount=1.0)
+        return closures.digest(closures.settled(problem, 1), 1), digest_of(lambda x: jax.random.uniform(key, x.shape))
+
+    assert digest(0) == digest(0)
+    assert not set(digest(0)) & set(digest(1))
+
+
+@pytest.mark.parametrize("function", [lambda x: x + 1, lambda x: x @ x])
+def test_a_digest_contains_the_functions_in_the_structure_of_a_tree(function):
+    """Printing a structure shows the addresses of its functions, and not their data."""
+
+    def digest(held):
+        return digest_of(jax.tree.structure(jax.tree_util.Partial(closures.Marked(held))))
+
+    assert digest(function) == digest(types.FunctionType(function.__code__, globals()))
+    assert digest(function) != digest(lambda x: x + 2)
+
+
+def test_a_digest_contains_the_state_of_an_object_written_in_c():
+    made = [np.random.default_rng(seed) for seed in (0, 0, 1)]
+    assert digest_of(made[0]) == digest_of(made[1]) != digest_of(made[2])
+
+
+def test_a_host_function_that_holds_a_traced_number_has_a_digest():
+    """The host can use only its shape; its computation is part of the program."""
+    found = []
+
+    def loss(p):
+        found.append(digest_of(lambda x: x + p.size))
+        return p
+
+    for parameters in (1.0, np.ones(2), 2.0):
+        jax.make_jaxpr(lambda p: loss(p))(parameters)  # a new function, because JAX traces each of them once
+    assert found[0] == found[2] != found[1]
 
 
 @pytest.mark.filterwarnings("ignore:the primitive 'pure_callback'")

@@ -183,7 +183,7 @@ def _coarser(marched: Marched, times: np.ndarray, held: np.ndarray) -> _Coarse:
         reason = ONE_STEP
     else:
         on = task.on.on_grid(coarse)
-        kept = _far_apart(times, float(task.horizon), (FEWEST if task.method.limited else FEW) / marched.steps)
+        kept = _far_apart(times, float(task.horizon), (FEWEST if task.method.limited else FEW) / max(marched.steps, 1))
         return _Coarse(on, _longer(marched, times[kept]), kept)
     if others == grid.edges:
         return _Coarse(None, 1.0, everything, reason)
@@ -301,8 +301,11 @@ def _at_all_times(errors: np.ndarray, known: np.ndarray, solution: Solution, mar
 
     The error at a time in between is at most the largest at both neighbours near a node: it moves by one cell per step.
     """
-    times, per_time = solution.times, marched.steps / (float(marched.task.horizon) - float(solution.times[0]))
-    for i in np.setdiff1d(np.arange(len(errors)), known):
+    between, times = np.setdiff1d(np.arange(len(errors)), known), solution.times
+    if not between.size:  # also a march without a step
+        return errors
+    per_time = marched.steps / (float(marched.task.horizon) - float(times[0]))
+    for i in between:
         near = [k for k in (known[known < i][-1:], known[known > i][:1]) if k.size]
         found = np.max([errors[int(k[0])] for k in near], axis=0)
         for _ in range(math.ceil(max(abs(times[int(k[0])] - times[i]) for k in near) * per_time)):

@@ -62,6 +62,7 @@ def test_a_slow_run_of_samples_is_not_slowed_down():
 
 
 @pytest.mark.filterwarnings("ignore:the optimal drift leaves")
+@pytest.mark.filterwarnings("ignore:the grid is coarse")
 @pytest.mark.parametrize(
     ("scheme", "stages"),
     [

@@ -241,7 +241,7 @@ def defects(spline: Spline, known: Sequence[CellBlock], values: np.ndarray, befo
 
 
 @quietly
-def policy(spline: Spline, known: Sequence[CellBlock], values: np.ndarray) -> np.ndarray:
+def greedy_policy(spline: Spline, known: Sequence[CellBlock], values: np.ndarray) -> np.ndarray:
     """The control of ``Defects`` from numbers at the centres of the cells only.
 
     Args:

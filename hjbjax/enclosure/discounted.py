@@ -65,7 +65,7 @@ class DiscountTask:
 
     def policy(self, values: np.ndarray) -> np.ndarray:
         """The control that is optimal for the spline in every cell, (*cells, m); proves nothing."""
-        return defect.policy(self.spline, self.known, values)
+        return defect.greedy_policy(self.spline, self.known, values)
 
     def mover(self, policy: np.ndarray) -> Move:
         """The correction of the coefficients as a function of a source at the nodes, relative to the discount."""

@@ -134,7 +134,7 @@ def test_a_list_of_cells_has_the_defects_of_all_cells(controls):
         listed = defect.defects(spline, defect.blocks(problem, grid, spline, every, 0), values)
         some = draw.random(spline.shape) < 0.3
         part = defect.defects(spline, defect.chosen_cells(mesh, some), values)
-        policy = defect.policy(spline, mesh, values)
+        policy = defect.greedy_policy(spline, mesh, values)
     for name in ("low", "high", "policy"):
         np.testing.assert_allclose(getattr(listed, name), getattr(whole, name), rtol=1e-12)
         np.testing.assert_allclose(getattr(part, name)[some], getattr(whole, name)[some], rtol=1e-12)

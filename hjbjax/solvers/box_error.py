@@ -182,7 +182,8 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
             if not np.any(moved):
                 return BoxError(None, NEVER_REACHED)
         # the last factors are good enough for the step that ends the iteration
-        if solve is None or np.max(np.abs(delta := solve(source))) > SETTLED * np.max(change):
+        delta = None if solve is None else solve(source)
+        if delta is None or np.max(np.abs(delta)) > SETTLED * np.max(change):
             solve = rows.factored(grid)
             delta = solve(source)
         value, largest = value + delta, np.max(np.abs(delta))

@@ -40,11 +40,11 @@ REACH = 2  # fine nodes on both sides of a coarse node
 STRAIGHT = 1.9
 SMEARED = (0.5, 1.0, 1.5, 1.75, STRAIGHT), (0.5, 1.0, 0.6, 0.67, 2.0)
 BENT = 0.1  # second differences below this fraction of the first differences do not determine the order
-# differences fall like h^a: a jump if a is below JUMP, none if a is above CONTINUOUS; √distance has a = 1/2
-JUMP, CONTINUOUS = 0.3, 0.6
+# differences fall like h^a: a jump if a is below the first, none if a is above the second; √distance has a = 1/2
+JUMPS = 0.3, 0.6
 # In a march a scheme of order p smears a jump over a width h^(p/(p+1)), and differences there fall like h^(1/(p+1)). A
 # third of the range of V for p = 1 made the estimate a sixth of the error.
-SMEARED_JUMP, SMEARED_CONTINUOUS = 0.5, 0.8
+SMEARED_JUMPS = 0.5, 0.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class TwoGrids:
       held: the fixed nodes, bool (*grid).
       chain: the value of the monotone chain on ``grid``, if V_h belongs to another scheme; else None.
       highest: the order of the scheme where V is smooth.
-      marched: True for values of marches, in which jumps move and are smeared.
+      jumps: the exponents between which differences show a jump: ``JUMPS``, or ``SMEARED_JUMPS`` for a march.
     """
 
     grid: Grid
@@ -69,7 +69,7 @@ class TwoGrids:
     held: np.ndarray
     chain: np.ndarray | None = None
     highest: float = SECOND
-    marched: bool = False
+    jumps: tuple[float, float] = JUMPS
 
 
 def estimate_error(answers: TwoGrids) -> np.ndarray:
@@ -102,8 +102,7 @@ def estimate_on_coarse(answers: TwoGrids) -> np.ndarray:
         )
         order = np.minimum(bends, _order_of_slopes(change, gain, coarse))
     order = np.minimum(order, answers.highest)
-    limits = (SMEARED_JUMP, SMEARED_CONTINUOUS) if answers.marched else (JUMP, CONTINUOUS)
-    return np.maximum(change / (ratio**order - 1), _jumps(fine, rough, ratio, limits))
+    return np.maximum(change / (ratio**order - 1), _jumps(fine, rough, ratio, answers.jumps))
 
 
 def is_a_point(target: np.ndarray) -> bool:

@@ -11,7 +11,7 @@ by at the two neighbouring times.
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,13 +29,13 @@ from hjbjax.solution.status import Status
 from hjbjax.solvers import box_error, grid_error, horizon_samples, march_run, nested_grids, time_probes
 from hjbjax.solvers.box_error import BoxError
 from hjbjax.solvers.coarser_answer import LOSES, OVER, TOO_FEW
-from hjbjax.solvers.grid_error import TwoGrids
+from hjbjax.solvers.grid_error import SMEARED_JUMPS, TwoGrids
 from hjbjax.solvers.march_discontinuities import error_along_paths
 from hjbjax.solvers.result import warn_of_grid
 from hjbjax.solvers.setup import march_evaluation
 
-# least number of steps between two kept times of the coarse march; the error of implicit steps is that of the time, and
-# three of them cannot be halved
+# least number of implicit steps and of explicit steps between two kept times of the coarse march; most of the error of
+# implicit steps is that in time, and three of them cannot be halved
 FEW, FEWEST = 4, 2
 UNSETTLED = "not estimated: the march on the coarser grid did not come to its end"
 ONE_STEP = "not estimated: the march took one step, and a coarser one cannot take fewer"
@@ -100,15 +100,23 @@ def with_march_errors(solution: Solution, marched: Marched, clock: Clock) -> Sol
     coarse = _coarser(marched, np.asarray(solution.times), held)
     first = None if coarse.on is None else _again(marched, coarse, coarse.on, solution, clock)
     other = None if first is None or coarse.reason else _from_other_samples(marched, coarse, solution, clock)
-    solution = _with_grid_error(solution, marched, coarse, (first, other, held, points))
+    solution = _with_grid_error(solution, marched, coarse, (first, other), held, points)
     return box_error.reported(solution, _box_error(solution, marched, coarse, first, clock))
 
 
 def _with_grid_error(
-    solution: Solution, marched: Marched, coarse: _Coarse, found: tuple[Any, Any, np.ndarray, bool]
+    solution: Solution,
+    marched: Marched,
+    coarse: _Coarse,
+    found: tuple[np.ndarray | None, np.ndarray | None],
+    held: np.ndarray,
+    points: bool,
 ) -> Solution:
-    """The solution with an estimate of the discretisation error in space and time, from V on the coarser grid."""
-    first, other, held, points = found
+    """The solution with an estimate of the discretisation error in space and time.
+
+    ``found``: V on the coarser grid, and from other values at the horizon.
+    """
+    first, other = found
     if coarse.reason or first is None or coarse.on is None:
         solution.stats["grid_error"] = coarse.reason or UNSETTLED
         return solution
@@ -118,7 +126,7 @@ def _with_grid_error(
     for i, before in zip(coarse.kept, first, strict=True):
         if solution.times[i] < horizon:  # V is prescribed at the horizon
             fixed = held[i % len(held)]
-            answers = TwoGrids(grid, coarse.on.grid, value[i], before, fixed, highest=highest, marched=True)
+            answers = TwoGrids(grid, coarse.on.grid, value[i], before, fixed, highest=highest, jumps=SMEARED_JUMPS)
             errors[i] = grid_error.estimate_error(answers)
     missed = error_along_paths(solution, marched.task, marched.start, held)
     if missed is not None:

@@ -115,9 +115,9 @@ def _of_object(thing: Any, known: dict[int, tuple[int, Any]]) -> Any:
             return "class", thing.__module__, thing.__qualname__
         own = {name: each for name, each in vars(thing).items() if isinstance(each, types.FunctionType)}
         return "class", thing.__qualname__, [_described(each, known) for each in (own, thing.__bases__)]
-    slots = [name for each in type(thing).__mro__ for name in _names(getattr(each, "__slots__", ()))]
     if type(thing).__reduce__ is not object.__reduce__ and (kept := _kept_by_pickle(thing)) is not None:
         return "object", _described(kept, known)
+    slots = [name for each in type(thing).__mro__ for name in _names(getattr(each, "__slots__", ()))]
     held = {name: getattr(thing, name, None) for name in slots} | getattr(thing, "__dict__", {})
     held = {n: each for n, each in held.items() if not isinstance(getattr(type(thing), n, None), cached_property)}
     words = "" if held else ADDRESS.sub("", repr(thing))  # written in C

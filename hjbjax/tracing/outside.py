@@ -40,10 +40,10 @@ CALLBACKS = ("pure_callback", "io_callback")
 # libraries whose functions do not change; a problem that only uses these does not have to be traced
 LIBRARIES = frozenset({"builtins", "functools", "hjbjax", "itertools", "jax", "jaxlib", "math", "numpy", "operator"})
 # operations with a number that do not change the kind of dependence on a state or a control
-ARITHMETIC = frozenset(
-    {"add", "add_any", "sub", "mul", "div", "max", "min", "clamp", "atan2", "dot_general", "concatenate"}
-    | {"gt", "ge", "lt", "le"}
-)
+ARITHMETIC = frozenset({
+    "add", "add_any", "sub", "mul", "div", "max", "min", "clamp", "atan2", "dot_general", "concatenate",
+    "gt", "ge", "lt", "le",
+})  # fmt: skip
 CALLED = frozenset({"jit", "pjit"})  # the same primitive in different versions of JAX
 INSIDE = "."  # between the name of a function and the name that it reads
 FLOATS = (float, np.floating)

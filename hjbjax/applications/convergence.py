@@ -31,12 +31,13 @@ from hjbjax.iteration.methods import Method
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.mode_axis import of_mode, with_modes
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import front_door, is_traced
+from hjbjax.problem.pytree import front_door
 from hjbjax.problem.types import Numbers
 from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status
 from hjbjax.solvers.stationary import solve
+from hjbjax.tracing.closures import refuse_traced
 
 REFINED = 1.1  # maximal ratio between the refinement factors of two axes
 
@@ -206,8 +207,7 @@ def convergence_study(
       >>> study.nodes.tolist(), abs(study.order - 1) < 0.15
       ([21, 41, 81], True)
     """
-    if is_traced(problem, grids, reference):  # seconds, statuses and masks must be concrete
-        raise ValueError("convergence_study: it runs at host level only, outside of jit, vmap and grad")
+    refuse_traced("convergence_study", problem, grids, reference)  # seconds, statuses and masks must be concrete
     ordered = _sort(grids)
     if isinstance(problem, Problem) and problem.modes is not None:
         ordered = tuple(with_modes(grid, problem.modes.names) for grid in ordered)

@@ -56,6 +56,7 @@ from hjbjax.solution.clock import Clock, noting_interrupts
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, keeping_warnings, warn
 from hjbjax.solvers.finite_horizon import march_part
+from hjbjax.tracing.closures import refuse_traced
 
 DOUBLINGS = 6  # at most this number, so the first march covers a 64th of the horizon
 SOON = 1e-6  # seconds: a time limit that ends a march after its initial evaluation
@@ -344,6 +345,7 @@ def _check_problem(problem: object, gamma: float) -> None:
     """Raise if the value of the problem is not determined by a gain."""
     if not isinstance(problem, Problem):
         raise TypeError(f"hinf_level: problem_of_gamma({gamma:g}) returned {problem!r:.60}, wanted a Problem")
+    refuse_traced("hinf_level", problem)
     refuse_rewards(problem, "hinf_level", "V shows a gain by the energy of an output, which is a cost")
     if not isinstance(problem.disturbances, (Box, Ball)):
         raise ValueError(

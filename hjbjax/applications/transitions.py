@@ -39,12 +39,13 @@ from hjbjax.markov_chain.policy_rates import traced_rates
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, front_door, is_traced
+from hjbjax.problem.pytree import altered, front_door
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number
 from hjbjax.solution.solution import Solution, SolveError
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.finite_horizon import march
+from hjbjax.tracing.closures import refuse_traced
 
 MOST = 60  # Newton steps: a moderate change needs 3 to 8
 SHORTEST = 1 / 64  # the shortest fraction of a Newton step
@@ -159,8 +160,7 @@ def transition(
       >>> path.prices[[0, 5, -1]].round(3).tolist()  # from 4/3 to 1.451 as capital declines
       [1.366, 1.433, 1.451]
     """
-    if is_traced(law, after.price, horizon, guess):
-        raise ValueError("transition: got traced numbers; it runs on the host only, outside of jit, vmap and grad")
+    refuse_traced("transition", problem_of, excess, law, after.price, horizon, guess)
     arguments.positive(horizon, "transition: horizon", "in units of time")
     arguments.count(steps, "transition: steps")
     arguments.positive(tol, "transition: tol", "as a fraction of the bracket", most=0.5)

@@ -10,6 +10,7 @@ from hjbjax.problem.grid import Grid
 from hjbjax.problem.pytree import front_door
 from hjbjax.solvers.finite_horizon import march
 from hjbjax.solvers.stationary import solve
+from hjbjax.tracing.closures import refuse_traced
 
 
 @front_door
@@ -40,6 +41,8 @@ def design(
     Returns:
       A Fit.
     """
+
+    refuse_traced("design", problem_of, criterion, parameters)
 
     def loss(parameters: Any) -> jax.Array:
         given = solve_options or {}

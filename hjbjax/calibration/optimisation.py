@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hjbjax.problem import arguments
-from hjbjax.problem.pytree import INTERRUPT, front_door, is_traced
+from hjbjax.problem.pytree import INTERRUPT, front_door
 from hjbjax.problem.settings import own_settings
 from hjbjax.solution import files
 from hjbjax.solution.checkpoints import KINDS, Checkpoint, check_alike, open_checkpoint
@@ -27,7 +27,7 @@ from hjbjax.solution.placement import Path
 from hjbjax.solution.solution import SolveError
 from hjbjax.solution.status import Status, warn
 from hjbjax.solvers.host_loop import progress_bar
-from hjbjax.tracing.closures import digest_of_program
+from hjbjax.tracing.closures import digest_of_program, refuse_traced
 
 RATE = 0.05  # learning rate of the default optimiser, relative to the size of each parameter
 EARLY = 1e-3  # fraction of the tolerance at which a run ends before its last step
@@ -173,8 +173,7 @@ def fit(
     """
     if not callable(loss):
         raise TypeError(f"fit: got loss = {loss!r:.100}, wanted a function of the parameters")
-    if is_traced(parameters):
-        raise ValueError("fit: got traced parameters, but it runs on the host: call it outside jit, vmap and grad")
+    refuse_traced("fit", loss, parameters)
     count = arguments.count(steps, "fit: steps")
     arguments.positive(tol, "fit: tol")
     if isinstance(restarts, bool) or not isinstance(restarts, (int, np.integer)) or restarts < 0:

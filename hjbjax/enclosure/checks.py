@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_random
-from hjbjax.problem.pytree import is_traced
 from hjbjax.solution.solution import Solution
+from hjbjax.tracing.closures import refuse_traced
 
 
 def check_types(caller: str, problem: Problem, solution: Solution) -> None:
@@ -13,8 +13,7 @@ def check_types(caller: str, problem: Problem, solution: Solution) -> None:
     for given, kind in ((problem, Problem), (solution, Solution)):
         if not isinstance(given, kind):
             raise TypeError(f"{caller}: got {type(given).__name__}, wanted a {kind.__name__}")
-    if is_traced(problem, solution.value):
-        raise ValueError(f"{caller}: got traced numbers; call it outside of jit, vmap and grad")
+    refuse_traced(caller, problem, solution.value)
 
 
 def check_ingredients(

@@ -21,7 +21,7 @@ from hjbjax.hamiltonian.pointwise import rule_of
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.labels import COST
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import altered, as_partial, front_door, pytree_dataclass
 from hjbjax.problem.rewards import costs_of, negative
 from hjbjax.problem.settings import own_settings
 from hjbjax.problem.types import Array, Number, State
@@ -115,8 +115,7 @@ def pontryagin(
       >>> round(extremal.cost, 8), extremal.costates[0].round(6).tolist()
       (1.0, [2.0])
     """
-    if is_traced(problem, x0, guess, terminal):
-        raise ValueError("pontryagin: got traced values, but it runs on the host: call it outside jit, vmap and grad")
+    closures.refuse_traced("pontryagin", problem, x0, guess, terminal, horizon)
     arguments.check_problem(problem, tol, max_nodes, time_limit)
     start = arguments.state_of_numbers(x0, "x0")
     arguments.check_guess(guess, len(start), horizon)

@@ -27,7 +27,7 @@ from hjbjax.feedback.path import Path, PathStatus
 from hjbjax.feedback.simulation import rollout
 from hjbjax.problem import arguments
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import as_partial, cast, front_door, is_traced, pytree_dataclass
+from hjbjax.problem.pytree import as_partial, cast, front_door, pytree_dataclass
 from hjbjax.problem.rewards import refuse_rewards
 from hjbjax.problem.sets import AdmissibleSet, Ball, Box, Finite, Simplex, refuse_unbounded
 from hjbjax.problem.settings import own_settings
@@ -267,8 +267,7 @@ def _check(
     random: object,
 ) -> np.ndarray:
     """The initial states, shape (k, n), after checks that the inequality applies to these paths."""
-    if is_traced(problem, solution, x0s):
-        raise ValueError("dissipation: it runs at host level only, outside of jit, vmap and grad")
+    closures.refuse_traced("dissipation", problem, solution, x0s)
     refuse_rewards(problem, "dissipation", "the inequality is about the energy of an output, which is a cost")
     if problem.disturbances is None or solution.disturbance is None or problem.cost is None:
         raise ValueError("dissipation: wanted a game with a cost, as hjb.attenuation(plant, gamma, hjb.Box(...))")

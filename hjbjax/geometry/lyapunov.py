@@ -24,7 +24,7 @@ from hjbjax.problem.settings import own_settings
 from hjbjax.problem.streams import encodable
 from hjbjax.problem.types import Array, Number, State
 from hjbjax.tracing import checks
-from hjbjax.tracing.closures import settled_function
+from hjbjax.tracing.closures import refuse_traced, settled_function
 
 Functions: TypeAlias = tuple[Callable, Callable]  # V and f, functions of (x) or (t, x)
 Climb: TypeAlias = tuple[jax.Array, jax.Array, jax.Array]  # the point, the measure there, and the length of a step
@@ -148,6 +148,7 @@ def lyapunov_check(
         raise ValueError(f"lyapunov_check: samples is {samples!r}, wanted a positive integer")
     if not 0 < tolerance < 1:
         raise ValueError(f"lyapunov_check: tolerance is {tolerance!r}, wanted a number between 0 and 1")
+    refuse_traced("lyapunov_check", V, f, region, times, equilibrium)
     span_of_times = _check_times(times)
     rest = np.zeros(region.dim) if equilibrium is None else np.asarray(equilibrium, np.float64)
     if rest.shape != (region.dim,):

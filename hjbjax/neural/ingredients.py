@@ -5,7 +5,6 @@ import numpy as np
 from hjbjax.hamiltonian import pointwise
 from hjbjax.hamiltonian.pointwise import Rule
 from hjbjax.problem.problem import Problem
-from hjbjax.problem.pytree import is_traced
 from hjbjax.problem.rewards import refuse_rewards
 from hjbjax.tracing import checks, closures
 
@@ -32,8 +31,7 @@ def settled_problem(problem: object, n: int, name: str, refused: dict[str, str])
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"{name}: got {type(problem).__name__}, wanted a Problem")
-    if is_traced(problem):
-        raise ValueError(f"{name}: got traced numbers, but it runs on the host: call it outside jit, vmap and grad")
+    closures.refuse_traced(name, problem)
     refuse_rewards(problem, name, "a network is trained on costs")
     for field, why in (REFUSED | refused).items():
         if getattr(problem, field) is not None:

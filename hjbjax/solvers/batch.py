@@ -67,7 +67,7 @@ from hjbjax.solvers.setup import (
 from hjbjax.solvers.stationary import check_arguments, check_limits
 from hjbjax.solvers.stationary_run import LanesRun, stack_lanes, with_obstacles
 from hjbjax.tracing import checks
-from hjbjax.tracing.closures import with_settled_functions
+from hjbjax.tracing.closures import refuse_traced, with_settled_functions
 from hjbjax.well_posedness import admissibility, node_checks
 from hjbjax.well_posedness.attainability import Reach
 
@@ -116,7 +116,7 @@ def solve_batch(
       One solution per problem, in the same order.
 
     Raises:
-      ValueError: a problem has no solution; the message names the lane.
+      ValueError: a problem has no solution; the message names the lane. Or a call inside ``jit``, ``vmap`` or ``grad``.
       SolveError: a lane did not converge, or was interrupted; ``.solution`` is the first such, ``.solutions`` are all.
     """
     if isinstance(problems, Problem) or not isinstance(problems, Iterable):
@@ -127,6 +127,7 @@ def solve_batch(
         if not isinstance(lane, Problem):
             raise TypeError(f"solve_batch: lane {number} is {shown(lane)}; wanted only problems")
         check_arguments(lane, grid, method, scheme, tol)
+    refuse_traced("solve_batch", *lanes, grid)
     check_slopes(scheme, "solve_batch: scheme")
     checks.check_indices(grid)
     kind = arguments.as_dtype(dtype)

@@ -124,12 +124,27 @@ def opened(function: Any, *arguments: jax.ShapeDtypeStruct) -> Any:
 
 
 def holds_tracers(thing: object, depth: int = 7) -> bool:
-    """True if a function closes over a tracer, directly or through a function that it closes over."""
+    """True for traced numbers, and for functions and problems that close over one, at most ``depth`` functions deep."""
+    inside: Iterable[object] = ()
     if isinstance(thing, Partial):
-        thing = thing.func
-    if depth == 0 or not isinstance(thing, types.FunctionType):
+        inside = thing.func, *thing.args, *thing.keywords.values()
+    elif isinstance(thing, Problem):
+        inside = vars(thing).values()
+    elif isinstance(thing, types.FunctionType):
+        inside = map(content, thing.__closure__ or ())
+    if depth == 0 or not inside:
         return is_traced(thing)
-    return any(holds_tracers(content(cell), depth - 1) for cell in thing.__closure__ or ())
+    return any(holds_tracers(each, depth - 1) for each in inside)
+
+
+def refuse_traced(caller: str, *things: object) -> None:
+    """Refuse to run on the host with the numbers, functions and problems of a JAX transformation.
+
+    Raises:
+      ValueError: names the caller.
+    """
+    if any(map(holds_tracers, things)):
+        raise ValueError(f"{caller}: got traced numbers, but it runs on the host: call it outside jit, vmap and grad")
 
 
 def with_settled_functions(function: Callable) -> Callable:
@@ -260,19 +275,21 @@ class Opened:
     It equals another that computes the same, so that the gradient of a loss does not recompile in its second step.
     """
 
-    def __init__(self, jaxpr: jex.Jaxpr):
-        self.jaxpr = jaxpr
+    def __init__(self, jaxpr: jex.Jaxpr, dtypes: tuple[DType, ...]):
+        # the dtypes of the numbers in the trace; without x64 the jaxpr still has NumPy's float64
+        self.jaxpr, self.dtypes = jaxpr, dtypes
         mark, whole = fingerprint(jaxpr)
-        self.mark = mark if whole else self.jaxpr
+        self.mark = (mark if whole else jaxpr), dtypes
 
     def __call__(self, known: tuple, *arguments: Any) -> Any:
         """The function's result, with ``known`` the numbers it closes over and its leaves."""
         constants, leaves = known
         # a jaxpr requires the dtypes of its trace, and a solve may have cast the leaves to float32 meanwhile
-        closed = self._in_traced_dtypes(constants, self.jaxpr.constvars)
-        return host_functions.evaluate_with_host_calls(
-            self.jaxpr, closed, *self._in_traced_dtypes((*leaves, *arguments), self.jaxpr.invars)
-        )[0]
+        closed = _in_dtypes(constants, self.dtypes)
+        traced = (cast(jax.core.ShapedArray, var.aval).dtype for var in self.jaxpr.invars)
+        return host_functions.evaluate_with_host_calls(self.jaxpr, closed, *_in_dtypes((*leaves, *arguments), traced))[
+            0
+        ]
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Opened) and self.mark == other.mark
@@ -280,13 +297,10 @@ class Opened:
     def __hash__(self) -> int:
         return hash(self.mark)
 
-    @staticmethod
-    def _in_traced_dtypes(values: Iterable[Numbers], variables: Sequence[jex.Var]) -> list[jax.Array]:
-        """Numbers in the dtypes of variables."""
-        return [
-            jnp.asarray(value, cast(jax.core.ShapedArray, var.aval).dtype)
-            for value, var in zip(values, variables, strict=True)
-        ]
+
+def _in_dtypes(values: Iterable[Numbers], dtypes: Iterable[DType]) -> list[jax.Array]:
+    """Numbers in other dtypes."""
+    return [jnp.asarray(value, dtype) for value, dtype in zip(values, dtypes, strict=True)]
 
 
 def _as_traced(leaf: Numbers) -> Numbers:
@@ -345,7 +359,8 @@ def _settled_inside(function: Partial, shapes: Sequence[tuple[int, ...]], dtype:
 def _with_closure_as_leaves(function: Partial, closed: jex.ClosedJaxpr) -> Partial:
     """A traced function with the numbers it closes over among its leaves."""
     leaves = jax.tree.leaves((function.keywords, function.args))
-    return Partial(Opened(closed.jaxpr), (tuple(closed.consts), leaves))
+    dtypes = tuple(constant.dtype for constant in closed.consts)
+    return Partial(Opened(closed.jaxpr, dtypes), (tuple(closed.consts), leaves))
 
 
 def _bare(function: Partial) -> Partial:

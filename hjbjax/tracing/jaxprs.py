@@ -152,7 +152,11 @@ def closed(jaxpr: jex.Jaxpr) -> jex.ClosedJaxpr:
 
 
 def in_use(found: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
-    """A jaxpr with its constants in JAX's default types; without x64 a trace keeps NumPy's float64."""
+    """A jaxpr with constants of its own in JAX's default types.
+
+    JAX 0.10 converts a NumPy array once and returns the converted array again as long as something holds it, in 32 bits
+    as in 64. A jaxpr that is kept must therefore not hold it.
+    """
     from jax.extend.core import ClosedJaxpr
 
     return ClosedJaxpr(found.jaxpr, [_in_use(constant) for constant in found.consts])
@@ -162,7 +166,10 @@ def _in_use(constant: Any) -> Any:
     if jax.dtypes.issubdtype(constant.dtype, jax.dtypes.extended):  # a random key
         return constant
     dtype = jax.dtypes.canonicalize_dtype(constant.dtype)
-    return constant if constant.dtype == dtype else np.asarray(constant, dtype)
+    if not isinstance(constant, np.ndarray):
+        return constant if constant.dtype == dtype else np.asarray(constant, dtype)
+    # another view of the same memory, in the class that JAX does not convert again
+    return np.asarray(constant, dtype).view(type(constant))
 
 
 def without_repetitions(found: jex.ClosedJaxpr) -> jex.ClosedJaxpr:

@@ -117,17 +117,18 @@ class Rates:
         return Rates(tuple(opposite), tuple(arriving), landings=tuple(each.reversed() for each in self.landings))
 
 
-def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
+def jump_rates(on: Discretisation, u: list, d: list | None = None, *, speed: float = 1.0) -> Rates:
     """The jump rates under a policy of the scheme's monotone chain.
 
     Args:
       on: the discretisation; only drift and noise of its problem are used.
       u: the m components of the control, each broadcasting to (*grid).
       d: the components of the disturbance, in a game.
+      speed: a factor of the drift.
     """
     grid = on.grid
     x, u, d = tie((on.coordinates(), u, d))  # otherwise loops keep drift that u does not change
-    first, *others = on.drifts(u, d, x)
+    first, *others = _drifts(on, u, d, x, speed)
     table = _table(on, first, on.diffusion(u, d, x))
     for other in others:  # jumps of either chain
         for offset, rate in _table(on, other, {}).items():
@@ -143,6 +144,12 @@ def jump_rates(on: Discretisation, u: list, d: list | None = None) -> Rates:
     one_way = on.problem.noise is None and on.scheme.chain.one_way and not others
     ending = next((jnp.broadcast_to(-growth, grid.shape) for growth in on.growth(u, d, x)), None)
     return Rates(tuple(table), values, one_way, landings, ending)
+
+
+def _drifts(on: Discretisation, u: Any, d: Any, x: Any, speed: float) -> list[list]:
+    """The parts of the drift times ``speed``."""
+    found = on.drifts(u, d, x)
+    return found if speed == 1 else [[speed * f for f in drift] for drift in found]
 
 
 def _table(on: Discretisation, f: list, a: dict[tuple[int, int], Any]) -> dict[Offset, Any]:
@@ -178,17 +185,17 @@ def _reflect(table: dict[Offset, Any], grid: Grid, axis: int, step: int, *, nois
     table[outwards] = jnp.where(beyond, 0, rate)
 
 
-def fastest_rate(on: Discretisation) -> jax.Array:
+def fastest_rate(on: Discretisation, speed: float = 1.0) -> jax.Array:
     """max over the actions of Q at every node, (*grid): with Δt = 1/(Q + β) value iteration is monotone.
 
     If the drift is affine in u, Q is convex in u, so the corners of the sets suffice; samples are added for other
-    drifts.
+    drifts. ``speed`` is a factor of the drift.
     """
     result = jnp.zeros(on.grid.shape, on.dtype)
     us, ds = (list(sets.probes(each, on.dtype)) for each in (on.problem.controls, on.problem.disturbances))
     if on.apart:  # Q is a sum over the players; pairs of probes would double the compile time
-        mine = (_table(on, on.drifts(u, ds[0])[0], on.diffusion(u, ds[0])) for u in us)
-        theirs = (_table(on, on.drifts(us[0], d)[1], {}) for d in ds)
+        mine = (_table(on, _drifts(on, u, ds[0], None, speed)[0], on.diffusion(u, ds[0])) for u in us)
+        theirs = (_table(on, _drifts(on, us[0], d, None, speed)[1], {}) for d in ds)
         tables = ([sum(table.values()) for table in each] for each in (mine, theirs))
         pairs = itertools.product(us, ds)
         switching = [
@@ -197,23 +204,23 @@ def fastest_rate(on: Discretisation) -> jax.Array:
         ]
         return functools.reduce(jnp.maximum, switching) + sum(functools.reduce(jnp.maximum, each) for each in tables)
     for u, d in itertools.product(us, ds):
-        result = jnp.maximum(result, jump_rates(on, u, d).total())
+        result = jnp.maximum(result, jump_rates(on, u, d, speed=speed).total())
     return result
 
 
-def largest_rate(on: Discretisation) -> jax.Array:
-    """max of Q over actions and nodes, a number, without an array of the nodes."""
+def largest_rate(on: Discretisation, speed: float = 1.0) -> jax.Array:
+    """max of Q over actions and nodes, a number, without an array of the nodes; ``speed`` is a factor of the drift."""
     pairs = list(
         itertools.product(*(sets.probes(each, on.dtype) for each in (on.problem.controls, on.problem.disturbances)))
     )
     if on.apart or len(pairs) == 1:
-        return on.grid.layout.largest(fastest_rate(on))
+        return on.grid.layout.largest(fastest_rate(on, speed))
     us, ds = ([jnp.stack(list(entries)) for entries in zip(*each, strict=True)] for each in zip(*pairs, strict=True))
 
     def larger(k: Any, largest: jax.Array) -> jax.Array:
         # one action at a time: for all at once XLA keeps common terms, 17 arrays for a quadrotor in six dimensions
         u, d = ([entry[k] for entry in entries] for entries in (us, ds))
-        return jnp.maximum(largest, on.grid.layout.largest(jump_rates(on, u, d).total()))
+        return jnp.maximum(largest, on.grid.layout.largest(jump_rates(on, u, d, speed=speed).total()))
 
     return jax.lax.fori_loop(0, len(pairs), larger, jnp.zeros((), on.dtype))
 

@@ -363,8 +363,12 @@ def forced_only(task: Task, clock: Clock) -> tuple[Task, Mask | None]:
 
 
 def _with_refuge(task: Task) -> Task:
-    """The task with nodes fixed at zero where a run may continue indefinitely without paying, as at rest nodes."""
-    if task.problem.is_game or task.constrained or np.asarray(task.problem.discount) > 0:
+    """The task with nodes fixed at zero where a run may continue indefinitely without paying, as at rest nodes.
+
+    In a game the control must be able to enforce this, and a target may be worth more, so there must be none.
+    """
+    game = task.problem.is_game
+    if (game and task.problem.target is not None) or task.constrained or np.asarray(task.problem.discount) > 0:
         return task
     # on the target the run has ended; elsewhere it could continue at the least cost of all actions
     free = ~np.broadcast_to(np.asarray(task.obstacles.ended), task.grid.shape)
@@ -373,7 +377,8 @@ def _with_refuge(task: Task) -> Task:
     # if something can be earned, cycling at no cost need not be optimal
     if np.any(least[free] < -small):
         return task
-    found = attainability.refuge(task.on, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype))
+    search = attainability.held_by_control if game else attainability.refuge
+    found = search(task.on, jnp.asarray((least <= small) & free), jnp.asarray(small, task.tol.dtype))
     return dataclasses.replace(task, obstacles=dataclasses.replace(task.obstacles, fixed=task.obstacles.fixed | found))
 
 

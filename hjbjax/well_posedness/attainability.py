@@ -280,9 +280,25 @@ def _controllable_predecessors(
     on: Discretisation, inside: jax.Array, found: jax.Array, least: Number
 ) -> tuple[jax.Array, Scalar]:
     """``found`` plus the nodes from which the control leads there and stays ``inside``, and a flag if any was added."""
-    problem, grid, dtype, before = on.problem, on.grid, on.dtype, found
+    grid, before = on.grid, found
+    for offset, cost in zip((known := on.interventions()).offsets, known.costs, strict=True):
+        found |= inside & (cost < jnp.inf) & stencil.neighbour(found, grid, offset)
+
+    def leads(u: Action, d: Action) -> jax.Array:
+        # for every disturbance one jump must lead on, and none may leave
+        rates = jump_rates(on, u, d)
+        nearer = functools.reduce(jnp.logical_or, [(c > least) & ahead(found) for c, ahead in rates.jumps(grid)])
+        return nearer & _stays(rates, grid, inside, least)
+
+    new = found | (inside & _enforced(on, leads))
+    return new, jnp.any(new != before)
+
+
+def _enforced(on: Discretisation, holds: Callable[[Action, Action], jax.Array]) -> jax.Array:
+    """The nodes at which the control can make ``holds(u, d)`` true whatever the disturbance does, bool (*grid)."""
+    problem, shape = on.problem, on.grid.shape
     us, ds = (
-        jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, FEW), dtype)
+        jnp.asarray(np.zeros((1, 0)) if admissible is None else sets.samples(admissible, FEW), on.dtype)
         for admissible in (problem.controls, problem.disturbances)
     )
     upper = problem.isaacs == "upper"
@@ -291,23 +307,36 @@ def _controllable_predecessors(
 
     def answered(first: jax.Array) -> jax.Array:
         def also(ok: jax.Array, second: jax.Array) -> tuple[jax.Array, None]:
-            u, d = (first, second) if upper else (second, first)
-            rates = jump_rates(on, list(u), list(d))
-            leads = functools.reduce(jnp.logical_or, [(c > least) & ahead(found) for c, ahead in rates.jumps(grid)])
-            allowed = ~edges.inadmissible(on, list(u), list(d))
-            # for every disturbance one jump must lead on, and none may leave
-            good = leads & allowed & _stays(rates, grid, inside, least)
+            u, d = (list(each) for each in ((first, second) if upper else (second, first)))
+            good = holds(u, d) & ~edges.inadmissible(on, u, d)
             return (ok & good if upper else ok | good), None
 
-        return jax.lax.scan(also, jnp.full(grid.shape, upper), inner)[0]
+        return jax.lax.scan(also, jnp.full(shape, upper), inner)[0]
 
     def over(ok: jax.Array, first: jax.Array) -> tuple[jax.Array, None]:
         return (ok | answered(first) if upper else ok & answered(first)), None
 
-    for offset, cost in zip((known := on.interventions()).offsets, known.costs, strict=True):
-        found |= inside & (cost < jnp.inf) & stencil.neighbour(found, grid, offset)
-    new = found | (inside & jax.lax.scan(over, jnp.full(grid.shape, not upper), outer)[0])
-    return new, jnp.any(new != before)
+    return jax.lax.scan(over, jnp.full(shape, not upper), outer)[0]
+
+
+@jax.jit
+def held_by_control(on: Discretisation, inside: jax.Array, dearest: Scalar) -> jax.Array:
+    """The nodes of a game from which the control stays ``inside`` indefinitely at a running cost ≤ ``dearest``.
+
+    This is the largest set in which every node has a control whose jumps all stay in the set under every disturbance.
+    In a lower game the control may depend on the disturbance. A continuum is sampled by few actions. Bool (*grid).
+    """
+
+    def shrink(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        before = carry[0]
+
+        def stays(u: Action, d: Action) -> jax.Array:
+            return (on.running_cost(u, d) <= dearest) & _stays(jump_rates(on, u, d), on.grid, before, 0.0)
+
+        found = before & _enforced(on, stays)
+        return found, jnp.any(found != before)
+
+    return jax.lax.while_loop(lambda carry: carry[1], shrink, (inside, jnp.ones((), bool)))[0]
 
 
 def refuge(on: Discretisation, inside: jax.Array | None = None, dearest: Scalar | None = None) -> jax.Array:

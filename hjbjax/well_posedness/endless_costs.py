@@ -2,6 +2,7 @@
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem
+from hjbjax.problem.sets import Finite
 
 
 def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
@@ -20,11 +21,21 @@ def ill_posed(problem: Problem, has_rest: bool, grid: Grid) -> None:
     if problem.discount > 0 or has_rest or any(end is not None for end in ends):
         return
     word = problem.labels.word
+    moved = problem.is_game or isinstance(problem.controls, Finite)
     raise ValueError(
-        f"Problem: there is no finite solution: discount = 0, and the {word('cost')} accumulates forever: there is no "
-        f"target,\nno {word('stopping_cost')}, no running_max and no node where the system can rest at no "
+        f"Problem: on this grid there is no finite solution: discount = 0, and the {word('cost')} accumulates forever: "
+        f"there is\nno target, no {word('stopping_cost')}, no running_max and no node where the system can rest at no "
         f"{word('cost')}.\nGive discount > 0, or a target, or put a rest point (drift 0 and {word('cost')} 0 for some "
-        "control) on a node,\nor march over a finite horizon" + _middle(grid)
+        "control) on a node,\nor march over a finite horizon" + _middle(grid) + (_near(problem) if moved else "")
+    )
+
+
+def _near(problem: Problem) -> str:
+    """Advice where a path stays near a state by one action after the other, which a grid does not resolve."""
+    who = "the disturbance moves it" if problem.is_game else "every action of the Finite set moves it"
+    return (
+        f".\nIf the system can only stay near a state because {who}, a target around this state ends the path: two or "
+        "more cells wide"
     )
 
 

@@ -166,7 +166,7 @@ OTHERS = {
 ON_HOST = {
     "batch": lambda s, a: [each.value for each in hjb.solve_batch([plant(s, a, discount=1.0)] * 2, s["line"])],
     "pontryagin": lambda s, a: hjb.pontryagin(plant(s, a), [0.2], horizon=0.5).cost,
-    "level": lambda s, a: hjb.hinf_level(game(s, a), s["line"], 0.2, 3.0, tol=0.5, horizon=2.0).gamma,
+    "level": lambda s, a: hjb.hinf_level(game(s, a), s["line"], 0.2, 3.0, tol=0.5, horizon=8.0).gamma,
     "enclose": enclosed,
     "tube enclosed": tube_enclosed,
     "design": lambda s, a: (
@@ -198,16 +198,16 @@ def test_a_filter_reads_an_array_in_32_bits_after_checks_in_64():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hjbjax.solution.status.SolveWarning")
-@pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_another_call_runs_after_it(name, wide):
+def test_another_call_runs_after_it(name):
     """The function itself runs in ``jit`` before, or ``solve`` if it runs on the host only."""
-    jax.clear_caches()
-    objects, first = shared(), OTHERS.get(name, OTHERS["solve"])
-    with jax.enable_x64(wide):
-        assert np.isfinite(jax.jit(lambda a: total(first(objects, a)))(1.0))
-    for each in {name, "solve"}:
-        found, fresh = (jax.tree.leaves(FUNCTIONS[each](s, 1.0)) for s in (objects, shared()))
+    first = OTHERS.get(name, OTHERS["solve"])
+    for wide in (False, True):
+        jax.clear_caches()
+        objects = shared()  # JAX 0.10 itself fails if the caller traces one array in both precisions
+        with jax.enable_x64(wide):
+            assert np.isfinite(jax.jit(lambda a: total(first(objects, a)))(1.0))
+        found, fresh = (jax.tree.leaves(FUNCTIONS[name](s, 1.0)) for s in (objects, shared()))
         for one, other in zip(found, fresh, strict=True):
             np.testing.assert_array_equal(one, other)
 

@@ -235,3 +235,67 @@ def test_rest_where_every_action_costs_the_same():
     """At the origin u = 0 rests at no cost, though the cost does not favour it."""
     odd = hjb.Grid([-1.0, -2.0], [1.0, 2.0], (9, 11))
     assert hjb.solve(problem(discount=0.0), odd, tol=1e-2, scheme=hjb.Upwind()).value[4, 5] == 0.0
+
+
+# --- staying near a state by one action after the other ---
+
+NARROW = hjb.Grid([-1.0], [1.0], (41,))
+SHOVE = hjb.Box([-0.5], [0.5])
+
+
+def near_rest(x, *actions):
+    return jnp.maximum(jnp.abs(x[0]) - 0.3, 0) ** 2
+
+
+def up_to_the_wall(x, *actions):
+    return 1 - x[0]
+
+
+def game_by_value_iteration(cost, controls, shoves):
+    """The limit of long horizons of the upwind chain of f = u + d with projected ends, in NumPy."""
+    h, value, limit = 0.05, np.zeros(41), 1.5
+    for _ in range(4000):
+        up, down = np.append(np.diff(value), 0) / h, np.append(0, np.diff(value)) / h
+        f = np.add.outer(controls, shoves)[..., None]
+        moved = np.maximum(f, 0) * up + np.minimum(f, 0) * down
+        value = value + h / limit * (cost + moved.max(1).min(0))
+    return value
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cost", "controls", "shoves"),
+    [
+        (near_rest, U, SHOVE),
+        (near_rest, hjb.Finite([[-1.0], [1.0]]), hjb.Finite([[-0.5], [0.5]])),
+        (up_to_the_wall, U, SHOVE),
+        (near_rest, hjb.Finite([[-1.0], [1.0]]), None),
+    ],
+)
+def test_a_set_of_nodes_is_held_at_no_cost(cost, controls, shoves):
+    """The control keeps the state where nothing is paid; games of this kind were refused as endless."""
+    drift = (lambda x, u: u) if shoves is None else (lambda x, u, d: u + d)
+    problem = hjb.Problem(drift, cost, controls, disturbances=shoves)
+    solution = hjb.solve(problem, NARROW, tol=1e-9, scheme=hjb.Upwind())
+    paid = np.array([float(cost(x)) for x in NARROW.nodes()])
+    exact = game_by_value_iteration(paid, [-1.0, 0.0, 1.0], [0.0] if shoves is None else [-0.5, 0.0, 0.5])
+    np.testing.assert_allclose(solution.value, exact, atol=1e-8)
+
+
+@pytest.mark.parametrize("isaacs", ["upper", pytest.param("lower", marks=pytest.mark.slow)])
+def test_a_stronger_disturbance_holds_no_nodes(isaacs):
+    """In a lower game the control answers; |d| ≤ 1.2 moves the state out of every set all the same."""
+    strong = hjb.Box([-1.2], [1.2])
+    problem = hjb.Problem(lambda x, u, d: u + d, near_rest, U, disturbances=strong, isaacs=isaacs)
+    with pytest.raises(
+        ValueError, match=r"(?s)on this grid there is no finite solution.*because the disturbance moves"
+    ):
+        hjb.solve(problem, NARROW, scheme=hjb.Upwind())
+
+
+def test_switching_at_a_node_is_not_a_rest():
+    """The system rests at 0 by switching at no cost, V = |x|³/3; the chain pays for every switch."""
+    problem = hjb.Problem(straight, square, hjb.Finite([[-1.0], [1.0]]))
+    with pytest.raises(ValueError, match=r"(?s)on this grid there is no finite solution.*because every action") as said:
+        hjb.solve(problem, NARROW)
+    assert len(str(said.value).splitlines()) <= 6

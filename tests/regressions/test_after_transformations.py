@@ -206,7 +206,7 @@ def test_another_call_runs_after_it(name):
         jax.clear_caches()
         objects = shared()  # JAX 0.10 itself fails if the caller traces one array in both precisions
         with jax.enable_x64(wide):
-            assert np.isfinite(jax.jit(lambda a: total(first(objects, a)))(1.0))
+            assert np.isfinite(jax.jit(lambda a, objects=objects: total(first(objects, a)))(1.0))
         found, fresh = (jax.tree.leaves(FUNCTIONS[name](s, 1.0)) for s in (objects, shared()))
         for one, other in zip(found, fresh, strict=True):
             np.testing.assert_array_equal(one, other)

@@ -40,6 +40,10 @@ def near(x):
     return jnp.sum(jnp.abs(x)) - 0.3
 
 
+def forbidden(x):
+    return jnp.where(x[0] < 0.4, jnp.inf, 0.2)
+
+
 def leave(x):
     return 0.2 * jnp.cos(x[0])
 
@@ -144,6 +148,25 @@ QUESTIONS = {
         ),
         (lambda x, u: u + 0.3, lambda x, u: 1.0, lambda x: np.sum(np.abs(x)) - 0.3, lambda x: 0.0, 0.0),
         lambda x: 0.4,
+    ),
+    "round an axis, no stopping in a part": (
+        lambda: (
+            hjb.Problem(slide, hold, ONE, discount=0.6, stopping_cost=forbidden),
+            hjb.Grid([-1.0], [1.5], (12,), periodic=(True,)),
+        ),
+        (lambda x, u: u + 0.3, lambda x, u: 1.0, None, None, 0.6),
+        lambda x: np.inf if x[0] < 0.4 else 0.2,
+    ),
+    "a plane with a periodic axis, no stopping in a part": (
+        lambda: (
+            hjb.Problem(turn, square, ONE, discount=0.7, stopping_cost=forbidden),
+            hjb.Grid([-1.0, -1.2], [1.1, 1.0], (7, 8), periodic=(False, True)),
+        ),
+        (
+            lambda x, u: np.array([x[1], -x[0] + u[0] * (1 + 0.3 * np.cos(x[1]))]),
+            lambda x, u: 1 + x @ x + 0.1 * u[0], None, None, 0.7,
+        ),
+        lambda x: np.inf if x[0] < 0.4 else 0.2,
     ),
 }  # fmt: skip
 
@@ -270,6 +293,25 @@ def test_nodes_that_cannot_arrive_are_infinite():
     assert np.all(np.isfinite(solution.value[solution.reached]))
     assert not solution.reached[15:, 10].any()
     assert solution.reached[:10, 10].all()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*cannot reach the target")
+@pytest.mark.parametrize("scheme", [hjb.SemiLagrangian(), hjb.Upwind()])
+def test_infinite_values_beside_finite_ones_are_not_mixed(scheme):
+    """Time to a strip by motion in one direction round an axis; nodes beside the strip never arrive."""
+    problem = hjb.Problem(
+        lambda x, u: jnp.stack([0 * x[0], u[0]]), lambda x, u: 1.0, hjb.Box([0.0], [1.0]),
+        target=lambda x: jnp.maximum(jnp.abs(x[0]) - 0.51, jnp.abs(x[1]) - 0.1),
+    )  # fmt: skip
+    grid = hjb.Grid([-1.0, -1.0], [1.0, 1.0], (21, 20), periodic=(False, True))
+    solution = hjb.solve(problem, grid, scheme=scheme, tol=1e-9)
+    x, y = np.moveaxis(grid.nodes(), -1, 0)
+    time = np.where(np.abs(y) < 0.11, 0.0, np.mod(-0.1 - y, 2))
+    exact = np.where(np.abs(x) < 0.51, time, np.inf)
+    np.testing.assert_allclose(solution.value, exact, atol=1e-8)
+    between = [float(solution.value_at([x, 0.33])) for x in (-0.55, -0.5, -0.42, 0.5, 0.58)]
+    np.testing.assert_allclose(between, [np.inf, 1.57, 1.57, 1.57, np.inf], atol=1e-8)
 
 
 # --- what it is not for ---

@@ -344,6 +344,7 @@ def _question(task: _Task) -> dict[str, Any]:
             )
     return {
         "loss or optimiser": digest_of_program(task.step, z, state, *task.numbers),
+        "first state of the optimiser": [np.asarray(leaf) for leaf in jax.tree.leaves(state)],
         "parameters": np.concatenate([task.start, task.scale]), "structure of the parameters": task.structure,
         "bounds": np.concatenate([task.lower, task.upper]),
     }  # fmt: skip

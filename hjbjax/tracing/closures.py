@@ -130,10 +130,13 @@ def opened(function: Any, *arguments: jax.ShapeDtypeStruct) -> Any:
     return function if closed is None or not is_traced(closed.consts) else _with_closure_as_leaves(found, closed)
 
 
-def holds_tracers(thing: object, depth: int = 7) -> bool:
+def holds_tracers(thing: object, depth: int = 9) -> bool:
     """True if a function closes over a tracer, directly or through a function that it closes over."""
     if isinstance(thing, Partial):
         thing = thing.func
+    if isinstance(thing, (dict, list, tuple)):  # JAX refuses dictionaries whose keys have no order
+        entries = thing.values() if isinstance(thing, dict) else thing
+        return depth > 0 and any(holds_tracers(each, depth - 1) for each in entries)
     if depth == 0 or not isinstance(thing, types.FunctionType):
         return is_traced(thing)
     return any(holds_tracers(content(cell), depth - 1) for cell in thing.__closure__ or ())

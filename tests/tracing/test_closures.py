@@ -815,6 +815,23 @@ def test_a_digest_contains_the_globals_of_a_host_function(monkeypatch):
     assert digest_with(read_through_a_global) != first
 
 
+def test_a_function_may_close_over_a_dictionary_whose_keys_have_no_order():
+    table = {1: [2.0], "a": {2: 3.0, "b": 4.0}}
+    assert not closures.holds_tracers(lambda x: table[1][0] * x)
+    endless = {1: 2.0}
+    endless["itself"] = endless
+    assert not closures.holds_tracers(lambda x: endless["itself"][1] * x)
+    assert digest_of(lambda x: table["a"]["b"] * x) == digest_of(lambda x: table["a"]["b"] * x)
+    found = []
+    jax.jit(lambda a: found.append(closures.holds_tracers(lambda x: {**table, 2: {"c": [a]}}[2]["c"][0] * x)) or a)(1.0)
+    jax.jit(lambda a: found.append(closures.holds_tracers(nested({**table, 2: {"c": [a]}}))) or a)(1.0)
+    assert found == [True, True]
+
+
+def nested(held):
+    return lambda x: held[2]["c"][0] * x
+
+
 def with_forward_rule(slope):
     same = jax.custom_jvp(lambda u: u)
     same.defjvp(lambda primals, tangents: (same(primals[0]), slope * tangents[0]))

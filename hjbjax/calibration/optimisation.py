@@ -61,6 +61,10 @@ class Fit(files.Saved):
     """
 
     FORMAT = "hjbjax.Fit"
+    KINDS: ClassVar = {
+        "names": (list,), "shapes": (list,), "loss": files.REAL, "status": (int,), "starts": (list,),
+        "gradient_error": (*files.REAL, type(None)), "seconds": files.REAL,
+    }  # fmt: skip
 
     parameters: Any
     loss: float

@@ -41,6 +41,7 @@ Kinds = Mapping[str, tuple[type, ...]]  # the types of the entries of a header, 
 REAL = (float, int)  # a number that is whole may be written as an integer
 
 REASON = 400  # characters of a message, which may quote the file
+OWN = "hjbjax."  # the beginning of the formats of this package
 MAX_HEADER = 1 << 24  # bytes; the header has settings and timings, not data
 
 # The only text that numpy writes before an array of numbers. It is matched, and not evaluated as in numpy, because it
@@ -282,7 +283,10 @@ def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, form: str, ver
     """The header, if its format and version are supported."""
     _check_member(archive, info, Expected(((None,),), (np.uint8,)))
     header = json.loads(_read_member(archive, info).tobytes())
-    if not isinstance(header, dict) or header.get("format") != form:
+    kind = header.get("format") if isinstance(header, dict) else None
+    if isinstance(kind, str) and kind != form and kind.startswith(OWN):
+        raise FileError(f"it holds a result of another kind, {kind:.60}, wanted {form}")
+    if kind != form:
         raise FileError(f"its header does not say {form!r}: another program wrote it")
     found = header.get("version")
     # JSON's true is a bool, which Python treats as the integer 1

@@ -44,7 +44,7 @@ def test_an_enclosure_is_read_from_its_file_bit_by_bit(found, plane, tmp_path):
         assert (again.status, again.message, again.stats) == (each.status, each.message, each.stats)
     with pytest.raises(FileExistsError):
         found.save(path)
-    with pytest.raises(FileError, match="another program"):
+    with pytest.raises(FileError, match="another kind, hjbjax.Solution, wanted hjbjax.Enclosure"):
         hjb.Enclosure.load(_foreign(tmp_path))
 
 
@@ -109,7 +109,7 @@ def test_a_tube_is_read_from_its_file_bit_by_bit(tubes, tmp_path):
         assert repr(again.grid) == repr(each.grid)
         for name in ("level", "is_free", "message", "stats", "above"):
             assert getattr(again, name) == getattr(each, name)
-    with pytest.raises(FileError, match="another program"):
+    with pytest.raises(FileError, match="another kind, hjbjax.Solution, wanted hjbjax.TubeEnclosure"):
         hjb.TubeEnclosure.load(_foreign(tmp_path))
 
 

@@ -44,6 +44,7 @@ import errno
 import itertools
 import json
 import os
+import stat
 from typing import Any
 
 import numpy as np
@@ -213,6 +214,8 @@ def load(path: Any) -> Feedback:
 
 def _read(path: Any) -> "tuple[dict, dict[str, np.ndarray]]":
     """The header and all arrays of a file."""
+    if not stat.S_ISREG(os.stat(path).st_mode) and not os.path.isdir(path):  # opening a pipe would block indefinitely
+        raise ValueError("it is not an ordinary file")
     with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
         size = os.fstat(stream.fileno()).st_size
         if (claimed := sum(member.file_size for member in file.zip.infolist())) > size:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -215,6 +216,15 @@ def test_a_file_that_claims_more_bytes_than_it_has_is_refused(tmp_path):
     np.savez_compressed(path, **{**content, "value": np.zeros((1000, 1000))})
     with pytest.raises(ValueError, match="it claims 8[0-9]* bytes of arrays and is"):
         numpy_feedback.load(path)
+
+
+def test_a_folder_and_a_pipe_are_refused(tmp_path):
+    """Opening a pipe waits for a writer."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe: damaged, or not .*it is not an ordinary file"):
+        numpy_feedback.load(tmp_path / "pipe")
+    with pytest.raises(IsADirectoryError):
+        numpy_feedback.load(tmp_path)
 
 
 def test_a_refusal_is_one_short_line(tmp_path):

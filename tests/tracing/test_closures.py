@@ -885,7 +885,7 @@ def flat(x, u):
     return u
 
 
-POSED = {
+SIMILAR = {
     "one noise": lambda: hjb.Problem(flat, square, PLANE, discount=1.0, noise=[[0.1], [0.2]]),
     "separate noises": lambda: hjb.Problem(flat, square, PLANE, discount=1.0, noise=[0.1, 0.2]),
     "push up": lambda: hjb.Problem(flat, square, PLANE, discount=1.0, pushes=[hjb.Push([0.0, 1.0], 1.0)]),
@@ -901,14 +901,14 @@ POSED = {
 def test_problems_whose_numbers_mean_something_else_have_other_digests(tmp_path):
     """A resumed solve returned the finished value of a push along another axis as that of this one."""
     grid = hjb.Grid([-1.0] * 2, [1.0] * 2, (5, 5))
-    hjb.solve(POSED["push up"](), grid, checkpoint=tmp_path / "run.npz")
-    for name, each in POSED.items():
+    hjb.solve(SIMILAR["push up"](), grid, checkpoint=tmp_path / "run.npz")
+    for name, each in SIMILAR.items():
         if name == "push up":
             hjb.solve(each(), grid, checkpoint=tmp_path / "run.npz", resume=True)
             continue
         with pytest.raises(hjb.FileError, match="made for another problem; give"):
             hjb.solve(each(), grid, checkpoint=tmp_path / "run.npz", resume=True)
-    digests = {closures.digest(closures.settled(POSED[name](), 2), 2) for name in ("one noise", "separate noises")}
+    digests = {closures.digest(closures.settled(SIMILAR[name](), 2), 2) for name in ("one noise", "separate noises")}
     assert len(digests) == 2
 
 

@@ -61,6 +61,10 @@ class Fit(files.Saved):
     """
 
     FORMAT = "hjbjax.Fit"
+    KINDS: ClassVar = {
+        "names": (list,), "shapes": (list,), "loss": files.REAL, "status": (int,), "starts": (list,),
+        "gradient_error": (*files.REAL, type(None)), "seconds": files.REAL,
+    }  # fmt: skip
 
     parameters: Any
     loss: float
@@ -343,6 +347,7 @@ def _question(task: _Task) -> dict[str, Any]:
             )
     return {
         "loss or optimiser": digest_of_program(task.step, z, state, *task.numbers),
+        "first state of the optimiser": [np.asarray(leaf) for leaf in jax.tree.leaves(state)],
         "parameters": np.concatenate([task.start, task.scale]), "structure of the parameters": task.structure,
         "bounds": np.concatenate([task.lower, task.upper]),
     }  # fmt: skip

@@ -72,11 +72,11 @@ def check_page_folder(out: Path, force: bool = False) -> None:
       OSError: with advice in one line.
     """
     placement.current_folder()  # otherwise JAX raises FileNotFoundError when it filters a traceback
-    if os.path.lexists(out) and not out.is_dir():
+    if os.path.lexists(out) and not os.path.isdir(out):
         raise NotADirectoryError(f"{out} exists but is not a folder; give another name")
     placement.check_place(out / PAGE, force=True)  # refuse a folder named index.html even with force
     # ignore hidden folders of this command
-    found = sorted(name for name in os.listdir(out) if not placement.OWN.fullmatch(name)) if out.is_dir() else []
+    found = sorted(name for name in os.listdir(out) if not placement.OWN.fullmatch(name)) if os.path.isdir(out) else []
     if not force and PAGE in found:
         raise FileExistsError(f"{out} contains {PAGE} already; give another --out, or --force to replace it")
     if not force and found:

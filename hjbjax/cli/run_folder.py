@@ -76,7 +76,7 @@ def takes(out: Path, file: str) -> bool:
     """True if the results in the folder ``out`` need the name of a file for one of them or for a parent folder."""
     whole, place = Path(placement.absolute(os.fspath(out))), Path(placement.absolute(file))
     # an existing folder is refused for that reason
-    return not place.is_dir() and place in (whole, *whole.parents, *(whole / name for name in FILES))
+    return not os.path.isdir(place) and place in (whole, *whole.parents, *(whole / name for name in FILES))
 
 
 @contextlib.contextmanager

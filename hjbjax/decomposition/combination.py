@@ -11,7 +11,7 @@ equal, and both kinds are evaluated.
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from hjbjax.solution.solution import Solution
 from hjbjax.solution.status import Status
 
 Places = tuple[tuple[int, ...], ...]
+LARGEST = 10**6  # number of states, controls or disturbances in a file: a query allocates an entry for each
 
 
 @pytree_dataclass(static=("rule", "bound", "states", "controls", "disturbances", "labels", "count"), host=("problem",))
@@ -50,6 +51,10 @@ class BlockSolution(files.Saved):
     """
 
     FORMAT = "hjbjax.BlockSolution"
+    KINDS: ClassVar = {
+        "parts": (list,), "rule": (str,), "bound": (str, type(None)), "states": (list,), "controls": (list,),
+        "disturbances": (list,), "labels": (list,), "count": (int,),
+    }  # fmt: skip
 
     parts: tuple[Solution, ...]
     rule: str
@@ -194,12 +199,20 @@ class BlockSolution(files.Saved):
         for i, own in enumerate(header["parts"]):
             mine = {name.partition(".")[2]: array for name, array in arrays.items() if name.startswith(f"part{i}.")}
             parts.append(Solution(**archive.fields(own, mine)))
-        states, controls, disturbances = (
-            tuple(tuple(map(int, each)) for each in header[name]) for name in ("states", "controls", "disturbances")
+        for name, known in {"rule": (SUM, MAX, MIN, FIRST), "bound": (None, "lower", "upper")}.items():
+            if header[name] not in known:
+                raise files.FileError(f"its {name} is {header[name]!r:.60}, wanted one of {known}")
+        count = header["count"]
+        states = _places_in_file(header, "states", [part.grid.ndim for part in parts], count)
+        controls, disturbances = (
+            _places_in_file(header, name, [_size(getattr(part, field)) for part in parts], LARGEST)
+            for name, field in (("controls", "policy"), ("disturbances", "disturbance"))
         )
+        if len({part.times is None for part in parts}) > 1:
+            raise files.FileError("some of its blocks depend on time and others do not")
         return cls(
             tuple(parts), header["rule"], header["bound"], states, controls, disturbances,
-            labelling.of_file(header["labels"]), int(header["count"]),
+            labelling.of_file(header["labels"]), count,
         )  # fmt: skip
 
     def _count(self, places: Places) -> int:
@@ -289,6 +302,33 @@ def _between_times(times: Array, values: Array, when: Array, nodes: Array | None
     nodes = jnp.broadcast_to(times, values.shape) if nodes is None else nodes
     flat = [jnp.reshape(each, (-1, each.shape[-1])) for each in (when, nodes, values)]
     return jax.vmap(jnp.interp)(*flat).reshape(when.shape)
+
+
+def _size(actions: Any) -> int | None:
+    """The number of controls or disturbances of a block; None if they are unknown."""
+    return None if actions is None else int(np.shape(actions)[-1])
+
+
+def _places_in_file(header: dict, name: str, sizes: Sequence[int | None], count: int) -> Places:
+    """The numbers of the states or inputs of every block in the header of a file.
+
+    Args:
+      header: the header.
+      name: the entry.
+      sizes: the number of states or inputs of every block; None if it is unknown.
+      count: the number of states or inputs of the whole problem, or a bound of it.
+
+    Raises:
+      FileError: they do not fit the blocks.
+    """
+    found = header[name]
+    lists = all(isinstance(each, list) for each in found) and len(found) == len(sizes)
+    if not sizes or not lists or not 0 < count <= LARGEST:
+        raise files.FileError(f"its {len(sizes)} blocks have {name} = {found!r:.60} of {count}")
+    for each, size in zip(found, sizes, strict=True):
+        if size not in (None, len(each)) or not all(type(place) is int and 0 <= place < count for place in each):
+            raise files.FileError(f"a block of {size} {name} has the numbers {each!r:.60}, wanted some of {count}")
+    return tuple(map(tuple, found))
 
 
 def _placed(entries: Sequence[Any], places: Sequence[tuple[int, ...]], count: int, chosen: Sequence[Any]) -> Any:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -118,6 +118,10 @@ class Enclosure(files.Saved):
     """
 
     FORMAT = "hjbjax.Enclosure"
+    KINDS: ClassVar = {
+        "grid": (dict,), "code": (int,), "message": (str,), "stats": (dict,), "splines": (list,), "levels": (list,),
+        "negated": (bool,), "capped": (bool,),
+    }  # fmt: skip
 
     grid: Grid
     lower: np.ndarray
@@ -192,7 +196,7 @@ class Enclosure(files.Saved):
             Bound(
                 spline, tuple(arrays[f"{name}_coefficients"]),
                 tuple(Levels(each[0], each[1], each[2], sign) for each in arrays[f"{name}_levels"]), sign,
-                arrays.get(f"{name}_caps"), bool(header["negated"]),
+                arrays.get(f"{name}_caps"), header["negated"],
             )
             for name, sign in zip(SIDES, (-1, 1) if header["negated"] else (1, -1), strict=True)
         )  # fmt: skip

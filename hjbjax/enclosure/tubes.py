@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -51,6 +51,10 @@ class TubeEnclosure(files.Saved):
     """
 
     FORMAT = "hjbjax.TubeEnclosure"
+    KINDS: ClassVar = {
+        "grid": (dict,), "level": files.REAL, "is_free": (bool,), "message": (str,), "stats": (dict,),
+        "above": (bool,), "times": (int,),
+    }  # fmt: skip
 
     grid: Grid
     level: float
@@ -108,7 +112,7 @@ class TubeEnclosure(files.Saved):
         shape, cyclic = archive.shape_of(header["grid"]), header["grid"]["periodic"]
         shapes: dict[str, tuple[int, ...]] = {name: (len(shape),) for name in ("lo", "hi")}
         shapes |= {**dict.fromkeys(("inner", "outer"), shape), "coefficients": (FEWEST, *shape)}
-        shapes |= {**dict.fromkeys(("shifts", "thresholds"), (2,)), "axis0": (int(header["times"]),)}
+        shapes |= {**dict.fromkeys(("shifts", "thresholds"), (2,)), "axis0": (header["times"],)}
         shapes |= {f"axis{k + 1}": (count + bool(cyclic[k]),) for k, count in enumerate(shape)}
         return {name: files.Expected((each,), (np.float64,), optional=False) for name, each in shapes.items()}
 
@@ -118,9 +122,9 @@ class TubeEnclosure(files.Saved):
         grid = archive.grid_of(header["grid"], arrays["lo"], arrays["hi"])
         first, second = arrays["thresholds"].tolist(), arrays["shifts"].tolist()
         return cls(
-            grid, header["level"], arrays["inner"], arrays["outer"], (second[0], second[1]), bool(header["is_free"]),
+            grid, header["level"], arrays["inner"], arrays["outer"], (second[0], second[1]), header["is_free"],
             header["message"], header["stats"], spline_of(arrays, (False, *grid.periodic)), arrays["coefficients"],
-            (first[0], first[1]), bool(header["above"]),
+            (first[0], first[1]), header["above"],
         )  # fmt: skip
 
 

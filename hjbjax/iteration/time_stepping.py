@@ -348,8 +348,8 @@ def _short_enough(
     return carry[2], _moved(front, until, carry[0])[1:], ~too_long((carry[0], 0, *carry[2:])), carry[3]
 
 
-def repeat(march: March, value: Field, start: float, end: float, count: int) -> tuple[Field, jax.Array]:
-    """V after ``count`` equal steps from ``start`` to ``end``, which are known numbers; differentiable in both modes.
+def repeat(march: March, value: Field, start: Number, dt: Number, count: int) -> tuple[Field, jax.Array]:
+    """V after ``count`` steps of length ``dt`` back from the time ``start``; differentiable in both modes.
 
     Reverse mode stores V before each of √count chunks, and recomputes the steps of one chunk at a time, twice. For K
     steps it stores about 2 √K values, plus the memory of one step.
@@ -360,7 +360,6 @@ def repeat(march: March, value: Field, start: float, end: float, count: int) -> 
     fine = jnp.ones((), bool)
     if count == 0:
         return value, fine
-    dt = (start - end) / count
     width = math.isqrt(count - 1) + 1
     numbers = jnp.arange(-(-count // width) * width).reshape(-1, width)
 

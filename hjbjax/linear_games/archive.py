@@ -62,7 +62,7 @@ def rebuild(header: dict, arrays: dict[str, np.ndarray]) -> LinearGame:
         terminal = Largest(n, own["rows"], own["offsets"], tuple(norms))
     sets = [_to_set(header[name], name, arrays) for name in SETS]
     a, c, b, d = (arrays[name] for name in MATRICES)
-    flags = {name: bool(header[name]) for name in ("exact", "negated", "playing")}
+    flags = {name: header[name] for name in ("exact", "negated", "playing")}
     return LinearGame(a, c, b, sets[0], d, sets[1], sets[2], terminal, **flags)
 
 

@@ -13,7 +13,7 @@ The formula is due to E. Hopf, Generalized solutions of nonlinear equations of f
 """
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -118,6 +118,12 @@ class HopfSolution(files.Saved):
     """
 
     FORMAT = "hjbjax.HopfSolution"
+    KINDS: ClassVar = {
+        **dict.fromkeys(("exact", "negated", "playing"), (bool,)),
+        **dict.fromkeys((*archive.SETS, "terminal"), (dict,)),
+        **dict.fromkeys(("horizon", "tol"), files.REAL), **dict.fromkeys(("labels", "players"), (list,)),
+        "intervals": (int,),
+    }  # fmt: skip
 
     game: LinearGame
     horizon: Any
@@ -285,7 +291,7 @@ class HopfSolution(files.Saved):
             float(header["horizon"]),
             controls,
             disturbances,
-            int(header["intervals"]),
+            header["intervals"],
             float(header["tol"]),
             labels,
         )

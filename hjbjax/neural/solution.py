@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,11 @@ from hjbjax.solution.status import Status
 from hjbjax.tracing import checks, closures
 
 BLOCKS = (1, 32, 1024)  # the numbers of states of one compiled program
+# the axes of the arrays of a file: n states, k nodes in time, and r entries of a quadratic function; others are numbers
+AXES = {
+    **dict.fromkeys(("lo", "hi", "state", "costate", "size", "center"), "n"),
+    **dict.fromkeys(("matrix", "norm"), "nn"), "nodes": "k", "change": "kr", "rates": "kr",
+}  # fmt: skip
 MESSAGES = {
     Status.CONVERGED: "The error on held-out data is below tol.",
     Status.MAX_STEPS: "Reached the number of steps with a held-out error above tol. Raise steps, or pass guess=.",
@@ -50,6 +55,10 @@ class NeuralSolution(files.Saved):
     """
 
     FORMAT = "hjbjax.NeuralSolution"
+    KINDS: ClassVar = {
+        "ansatz": (str,), "fields": (list,), "layers": (int,), "status": (int,), "validation": (dict,),
+        "seconds": files.REAL, "quadratic": (bool,),
+    }  # fmt: skip
 
     ansatz: Any
     lo: Any
@@ -203,6 +212,7 @@ class NeuralSolution(files.Saved):
         kinds: dict[str, Any] = {kind.__name__: kind for kind in (RestAnsatz, HorizonAnsatz, TargetAnsatz)}
         if header["ansatz"] not in kinds:
             raise FileError(f"its ansatz {header['ansatz']!r} is not known here: update hjbjax")
+        _check_shapes(header, arrays)
         weights = tuple((arrays[f"matrix{i}"], arrays[f"bias{i}"]) for i in range(header["layers"]))
         options: dict[str, Any] = {} if header["quadratic"] else {"quadratic": False}
         ansatz = kinds[header["ansatz"]](weights, **{name: arrays[name] for name in header["fields"]}, **options)
@@ -220,6 +230,26 @@ class NeuralSolution(files.Saved):
         lines = [f"{self.status}: {self.message}"]
         lines += [f"  {name.replace('_', ' '):<16} {value:.4g}" for name, value in (self.validation or {}).items()]
         return "\n".join([*lines, f"  {'seconds':<16} {self.seconds:.3g}"])
+
+
+def _check_shapes(header: dict, arrays: dict[str, np.ndarray]) -> None:
+    """Refuse arrays of a file whose shapes do not fit each other.
+
+    Raises:
+      FileError: one of them does not.
+    """
+    n = arrays["lo"].size
+    lengths = {"n": n, "k": arrays["nodes"].size if "nodes" in header["fields"] else 0, "r": 1 + n + n**2}
+    wanted = {name: tuple(lengths[axis] for axis in AXES.get(name, "")) for name in ("lo", "hi", *header["fields"])}
+    inputs = n + 2 * (header["ansatz"] == HorizonAnsatz.__name__)
+    for i in range(header["layers"]):
+        wanted |= {f"matrix{i}": (inputs, arrays[f"bias{i}"].size), f"bias{i}": (arrays[f"bias{i}"].size,)}
+        inputs = arrays[f"bias{i}"].size
+    if header["layers"] < 1 or inputs != 1:
+        raise FileError(f"its network has {header['layers']} layers and {inputs} outputs, wanted one output")
+    for name, shape in wanted.items():
+        if arrays[name].shape != shape:
+            raise FileError(f"its array {name!r} has shape {arrays[name].shape}, wanted {shape}")
 
 
 def weights_of_guess(guess: object, inputs: int, layers: Sequence[int], name: str) -> Any:

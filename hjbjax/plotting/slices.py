@@ -167,10 +167,9 @@ def _masks(known: Described, grid: Grid) -> dict[str, np.ndarray]:
     found = {} if known.stopping is None else {STOP: np.asarray(known.stopping)}
     if known.pushing is None:
         return found
-    pushes = getattr(known.problem, "pushes", ())
-    if not pushes:  # a solution from a file does not know its problem
+    if known.problem is None or not known.problem.pushes:  # a solution from a file does not know its problem
         return found | {PUSH: np.any(known.pushing, axis=-1)}
-    for number, push in enumerate(pushes):
+    for number, push in enumerate(known.problem.pushes):
         axis, sign = push.step
         name = f"{PUSH} {grid.names[axis]} {'up' if sign > 0 else 'down'}"
         found[name] = np.asarray(known.pushing)[..., number]

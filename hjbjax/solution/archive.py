@@ -10,7 +10,7 @@ from hjbjax.problem.labels import Labels
 from hjbjax.problem.mode_axis import with_modes
 from hjbjax.problem.stretching import Sinh
 from hjbjax.solution import numpy_feedback
-from hjbjax.solution.files import Expected, FileError
+from hjbjax.solution.files import Expected, FileError, check_kinds
 from hjbjax.solution.modes import switching_modes
 from hjbjax.solution.status import Status
 
@@ -28,6 +28,7 @@ KINDS: dict[str, tuple[type, ...]] = {  # types in the header of a file, as JSON
     "message": (str,),
     "stats": (dict,),
 }
+GRID: dict[str, tuple[type, ...]] = {"shape": (list, tuple), "periodic": (list, tuple), "names": (list, tuple)}
 
 
 def about_grid(grid: Grid) -> dict[str, Any]:
@@ -117,6 +118,7 @@ def feedback_contents(solution: Any) -> tuple[dict[str, Any], dict[str, np.ndarr
 
 def shape_of(about: dict[str, Any]) -> tuple[int, ...]:
     """The shape of a grid with a description from a header; refused before the sizes of arrays are computed."""
+    check_kinds(about, GRID, "its grid")
     shape = tuple(about["shape"])
     if not all(type(count) is int and count >= 2 for count in shape):
         raise FileError(f"its grid has shape {shape}")
@@ -125,6 +127,7 @@ def shape_of(about: dict[str, Any]) -> tuple[int, ...]:
 
 def plan(header: dict) -> dict[str, Expected]:
     """Shapes and dtypes of the arrays in a file; they follow from the grid in its header."""
+    check_kinds(header, {"grid": (dict,), "marched": (int, type(None))})
     shape, marched = shape_of(header["grid"]), header["marched"]
     # None: any number of inputs or residuals; the kept times of a marched solution are the leading axis
     many, lead = (None,), () if marched is None else (marched,)
@@ -153,9 +156,7 @@ def fields(header: dict, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     grid = grid_of(header["grid"], arrays.pop("lo"), arrays.pop("hi"))
     labels = labelling.of_file(header.get("labels", Labels()))
     header = {"monotone_error": None, **header}  # missing in older files
-    for name, kinds in KINDS.items():  # ``type`` and not ``isinstance``, because True is not a number of steps
-        if type(header[name]) not in kinds:
-            raise FileError(f"its header has {name} = {header[name]!r:.60}, wanted {kinds[0].__name__}")
+    check_kinds(header, KINDS)
     Status(header["code"])  # raises if there is no such status
     return {"policy": None, **arrays, "grid": grid, "labels": labels, **{name: header[name] for name in KINDS}}
 

@@ -33,6 +33,7 @@ from hjbjax.tracing import closures, descriptions
 FORMAT, VERSION = "hjbjax.Checkpoint", 1
 SECONDS = 60.0  # seconds between two writes
 KINDS = tuple(map(np.dtype, ("f8", "f4", "i8", "i4", "u4", "u1", "?")))  # of the arrays in a state
+RANDOM = ("jax_default_prng_impl", "jax_threefry_partitionable", "jax_random_seed_offset")
 # the statuses of an incomplete part, from which a later run continues
 CUT_SHORT = (Status.INTERRUPTED, Status.TIME_LIMIT, Status.MAX_STEPS, Status.RUNNING)
 
@@ -427,7 +428,8 @@ def _in_all_processes(path: str) -> Iterator[None]:
 def describe_question(problems: Sequence[Problem], grid: Grid | int, **others: Any) -> dict[str, str]:
     """The question of a run by parts, as text: digests of its problems, its grid, and its other arguments."""
     n = grid.ndim if isinstance(grid, Grid) else grid
-    found = {}
+    # these settings of JAX determine the numbers of a key; functions of a problem may use keys as well
+    found = {"setting of random numbers": repr([getattr(jax.config, name) for name in RANDOM])}
     if problems:
         digests = " ".join(closures.digest(problem, n) for problem in problems)
         found["problem" if len(problems) == 1 else "list of problems"] = digests

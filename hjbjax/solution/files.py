@@ -37,8 +37,11 @@ from hjbjax.solution.placement import (
 )
 
 T = TypeVar("T")
+Kinds = Mapping[str, tuple[type, ...]]  # the types of the entries of a header, as JSON returns them
+REAL = (float, int)  # a number that is whole may be written as an integer
 
 REASON = 400  # characters of a message, which may quote the file
+OWN = "hjbjax."  # the beginning of the formats of this package
 MAX_HEADER = 1 << 24  # bytes; the header has settings and timings, not data
 
 # The only text that numpy writes before an array of numbers. It is matched, and not evaluated as in numpy, because it
@@ -255,6 +258,19 @@ def _members(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
     return members
 
 
+def check_kinds(header: Mapping[str, Any], kinds: Kinds, where: str = "its header") -> None:
+    """Check that entries of a header exist and have the right types; True is not a number here.
+
+    Raises:
+      FileError: an entry is missing or of another type.
+    """
+    for name, wanted in kinds.items():
+        if name not in header:
+            raise FileError(f"{where} has no {name!r}: it is damaged, or of an older format")
+        if type(header[name]) not in wanted:
+            raise FileError(f"{where} has {name} = {header[name]!r:.60}, wanted {wanted[0].__name__}")
+
+
 def _memory() -> float:
     """The physical memory in bytes; infinite if the system does not report it."""
     try:
@@ -267,7 +283,10 @@ def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, form: str, ver
     """The header, if its format and version are supported."""
     _check_member(archive, info, Expected(((None,),), (np.uint8,)))
     header = json.loads(_read_member(archive, info).tobytes())
-    if not isinstance(header, dict) or header.get("format") != form:
+    kind = header.get("format") if isinstance(header, dict) else None
+    if isinstance(kind, str) and kind != form and kind.startswith(OWN):
+        raise FileError(f"it holds a result of another kind, {kind:.60}, wanted {form}")
+    if kind != form:
         raise FileError(f"its header does not say {form!r}: another program wrote it")
     found = header.get("version")
     # JSON's true is a bool, which Python treats as the integer 1
@@ -307,11 +326,12 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
 class Saved(abc.ABC):
     """The methods ``save`` and ``load`` of a result that one file holds.
 
-    A subclass has the class variables FORMAT, the name of the format, and VERSION, which is incremented when an older
-    hjbjax would misread a file.
+    A subclass has the class variables FORMAT, the name of the format, VERSION, which is incremented when an older
+    hjbjax would misread a file, and KINDS, the types of the entries of the header.
     """
 
     FORMAT: ClassVar[str]
+    KINDS: ClassVar[Kinds] = {}
     VERSION: ClassVar[int] = 1
 
     def save(self, path: Path, *, force: bool = False) -> None:
@@ -335,7 +355,7 @@ class Saved(abc.ABC):
 
     def _check_readable(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         """Raise ValueError if ``load`` would refuse the arrays, which would be lost in the file."""
-        expected = self._plan(json.loads(json.dumps({**header, "arrays": sorted(arrays)}, default=_plain)))
+        expected = self._checked_plan(json.loads(json.dumps({**header, "arrays": sorted(arrays)}, default=_plain)))
         for name, array in arrays.items():
             if complaint := expected[name].complaint(np.shape(array), np.asarray(array).dtype.str):
                 raise ValueError(f"{type(self).__name__}.save: {name} {complaint}")
@@ -350,7 +370,13 @@ class Saved(abc.ABC):
         Raises:
           FileError: the file is missing, damaged or foreign.
         """
-        return read(path, cls.FORMAT, cls.VERSION, cls._plan, cls._from_file)
+        return read(path, cls.FORMAT, cls.VERSION, cls._checked_plan, cls._from_file)
+
+    @classmethod
+    def _checked_plan(cls, header: dict) -> Mapping[str, Expected]:
+        """The arrays of a file with this header, whose entries have the right types."""
+        check_kinds(header, cls.KINDS)
+        return cls._plan(header)
 
     @abc.abstractmethod
     def _contents(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -43,6 +43,8 @@ epsilon ε of the type of ``value``.
 import errno
 import itertools
 import json
+import os
+import stat
 from typing import Any
 
 import numpy as np
@@ -197,20 +199,53 @@ def load(path: Any) -> Feedback:
     try:
         header, arrays = _read(path)
         if header["format"] == FORMAT and header["version"] <= VERSION:
-            return Feedback(header, {name: arrays[name] for name in header["arrays"]})
+            _check(header, arrays)
+            return Feedback(header, arrays)
         found = f"{header['format']}, version {header['version']}"
     except OSError as error:
         if error.errno not in (None, errno.EINVAL):  # offsets in a damaged file may lie before its start
             raise
         raise ValueError(f"{path}: damaged ({error})") from error
     except Exception as error:  # zipfile, json and NumPy raise a dozen types for damaged bytes
-        raise ValueError(
-            f"{path}: damaged, or not a file written by Solution.export ({type(error).__name__}: {error})"
-        ) from error
-    raise ValueError(f"{path}: got {found}; wanted {FORMAT} up to version {VERSION}, from Solution.export")
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise ValueError(f"{path}: damaged, or not a file written by Solution.export ({reason})") from error
+    raise ValueError(f"{path}: got {found[:200]}; wanted {FORMAT} up to version {VERSION}, from Solution.export")
 
 
 def _read(path: Any) -> "tuple[dict, dict[str, np.ndarray]]":
     """The header and all arrays of a file."""
+    if not stat.S_ISREG(os.stat(path).st_mode) and not os.path.isdir(path):  # opening a pipe would block indefinitely
+        raise ValueError("it is not an ordinary file")
     with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+        size = os.fstat(stream.fileno()).st_size
+        if (claimed := sum(member.file_size for member in file.zip.infolist())) > size:
+            raise ValueError(f"it claims {claimed} bytes of arrays and is {size} bytes long")
         return json.loads(file["header"].tobytes()), {name: file[name] for name in file.files}
+
+
+def _check(header: dict, arrays: "dict[str, np.ndarray]") -> None:
+    """Refuse arrays with other names, shapes or types than the format has, which would be another feedback."""
+    if set(arrays) - {"header"} != set(header["arrays"]):
+        raise ValueError(f"its arrays are {sorted(arrays)}, and its header lists {header['arrays']}")
+    names, modes = header["names"], header["modes"]
+    if not all(isinstance(name, str) for name in (*names, *modes)):
+        raise ValueError(f"its axes and modes are {names} and {modes}, wanted text")
+    n = len(names)
+    counts = tuple(len(arrays[f"nodes{axis}"]) for axis in range(n))
+    lead = (len(arrays["times"]),) if "times" in arrays else ()
+    wanted: dict[str, tuple[str, tuple[int, ...]]] = {
+        **dict.fromkeys(("lo", "hi"), ("f", (n,))), **dict.fromkeys(("periodic", "uniform"), ("b", (n,))),
+        "enumerated": ("b", (2,)), "value": ("f", lead + counts), "switching": ("i", lead + counts),
+        "times": ("f", lead), **{f"nodes{axis}": ("f", (count,)) for axis, count in enumerate(counts)},
+    }  # fmt: skip
+    for name in ("control", "disturbance"):
+        wanted[name] = "f", (*lead, *counts, *np.shape(arrays.get(name, 0))[-1:])
+    optional = {"control", "disturbance", "switching", "times"}
+    if (wrong := set(header["arrays"]) ^ set(wanted)) - (optional - set(header["arrays"])):
+        raise ValueError(f"it has the wrong arrays {sorted(wrong)}")
+    for name, (kind, shape) in wanted.items():
+        found = arrays.get(name)
+        if found is not None and (found.dtype.kind != kind or found.shape != shape):
+            raise ValueError(f"{name} is {found.dtype} of shape {found.shape}, wanted kind {kind!r} of shape {shape}")
+    if modes and counts[0] != len(modes):
+        raise ValueError(f"it has {len(modes)} modes and {counts[0]} values of the mode")

@@ -44,6 +44,7 @@ from hjbjax.solvers.settle import Settled
 MARCHED = 20_000  # largest coarse grid of marches for the box error only
 STEPS = 30  # largest number of Newton steps; most problems take two or three
 SETTLED = 0.05  # the iteration ends with a step below this fraction of the change so far
+SHRINKS = 0.5  # the last factors serve as long as a step is below this fraction of the one before
 FARTHEST = 100  # in units of the range of V: a larger change means that the other equation has no solution near V
 ROUNDING = 1e-9  # changes at the end nodes below this fraction of the range of V are rounding
 LARGE = 0.1  # fraction of the range of V: a larger box error is worth a warning ...
@@ -173,7 +174,7 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
     value, scale = start, np.ptp(counted := start[np.asarray(level.counted)])
     if _is_flat(counted):
         return BoxError(None, FLAT)
-    change, moved, solve = np.zeros_like(start), np.zeros(grid.shape, bool), None
+    change, moved, solve, largest = np.zeros_like(start), np.zeros(grid.shape, bool), None, np.inf
     for step in range(STEPS):
         rows = _equation(others, value, obstacles, defect)
         source = np.asarray(rows.source)
@@ -181,9 +182,9 @@ def _compare(level: Task, before: np.ndarray, fine: Grid) -> BoxError:
             moved = np.abs(source) > ROUNDING * scale
             if not np.any(moved):
                 return BoxError(None, NEVER_REACHED)
-        # the last factors are good enough for the step that ends the iteration
+        # where policies hardly change the last factors are good enough
         delta = None if solve is None else solve(source)
-        if delta is None or np.max(np.abs(delta)) > SETTLED * np.max(change):
+        if delta is None or not np.max(np.abs(delta)) <= SHRINKS * largest:
             solve = rows.factored(grid)
             delta = solve(source)
         value, largest = value + delta, np.max(np.abs(delta))

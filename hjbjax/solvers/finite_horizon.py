@@ -5,6 +5,7 @@ second from one kept time to the next, and reports. Under a tracer the same step
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -31,7 +32,7 @@ from hjbjax.problem.problem import Problem
 from hjbjax.problem.pytree import altered, as_one_program, cast, is_traced
 from hjbjax.problem.sets import Box, refuse_unbounded
 from hjbjax.problem.settings import own_settings
-from hjbjax.problem.types import Array, DType, Mask, Nodes, Scalar
+from hjbjax.problem.types import Array, DType, Field, Mask, Nodes, Scalar
 from hjbjax.solution import checkpoints
 from hjbjax.solution.checkpoints import Checkpoint
 from hjbjax.solution.clock import Clock, Stopped, noting_interrupts
@@ -480,38 +481,59 @@ def _march_traced(
         on, method, obstacles, jnp.inf, step, horizon, _blow_up_nodes(on, inner),
         checks_rates=checks_rates, checks_noise=checks_noise,
     )  # fmt: skip
-    value, values, actions, count = time_stepping.terminal(on.at(horizon), start), [], [], 0
-    touching: list[dict[str, Any]] = []
     unmoved = on.asking(_without_moving_target(on.problem))  # with the numbers of the cast above
     fine = _is_stable(on, method, horizon, step) & ~node_checks.state_fails(jax.lax.stop_gradient(unmoved))
-    for begin, end in itertools.pairwise([horizon, *kept[::-1].tolist()]):
-        # without 1e-6 rounding could add a step to a whole number of steps; none if a kept time is the horizon
-        steps = max(math.ceil((begin - end) / step - 1e-6), int(begin > end))
-        (value, ok), count = time_stepping.repeat(task, value, begin, end, steps), count + steps
-        fine &= ok & jnp.all(jnp.isfinite(value))
-        values.append(value)
-        pair = time_stepping.greedy_actions(task, value, end)
-        if not on.players.exact:  # the result of a search has no derivative of its own, that of a formula has all
-            acting = jnp.logical_not(task.obstacles_at(end).ended)
-            pair = adjoint.attach_actions(on.at(end), pair, value, acting)
-        actions.append(pair)
-        touching.append(contact(problem, grid, task.obstacles_at(end), value))
-    u, d = (
-        jnp.stack(
-            [jnp.stack(each[player], -1) if each[player] else jnp.zeros((*grid.shape, 0), kind) for each in actions]
-        )
-        for player in (0, 1)
-    )
-    found = jnp.stack(values[::-1]), u[::-1], d[::-1]
+    reached = time_stepping.terminal(on.at(horizon), start), fine
+    slices: list[Any] = []
+    counts, ends = _intervals(horizon, kept, step)
+    for steps, group in itertools.groupby(zip(counts, ends, strict=True), key=lambda each: each[0]):
+        # one loop over intervals with the same number of steps, because a program per interval compiles for minutes
+        rows = jnp.asarray([row for _, row in group], kind)
+        reached, found = jax.lax.scan(functools.partial(_interval, task, steps), reached, rows)
+        slices.append(found)
+    fine = reached[1]
+    found, sets = jax.tree.map(lambda *parts: jnp.concatenate(parts)[::-1], *slices)
     if throw:  # a factor instead of `where`, so that derivatives are NaN too
         found = jax.tree.map(lambda array: array * jnp.where(fine, 1, jnp.nan).astype(kind), found)
     code = jnp.where(fine, Status.CONVERGED, Status.STALLED if method.monotone_only else Status.DIVERGED)
-    sets: dict[str, Any] = {name: jnp.stack([masks[name] for masks in touching[::-1]]) for name in touching[0]}
     return Solution(
-        grid, found[0], found[1], found[2] if problem.is_game else None, code=code, steps=count, times=kept,
+        grid, found[0], found[1], found[2] if problem.is_game else None, code=code, steps=sum(counts), times=kept,
         **sets,
         **question(problem),
     )  # fmt: skip
+
+
+def _intervals(horizon: float, kept: np.ndarray, step: float) -> tuple[list[int], list[tuple[float, float, float]]]:
+    """The number of steps of each interval from the horizon back, and its beginning, its end and the length of a step.
+
+    The first interval has no steps if the last kept time is the horizon.
+    """
+    ends = list(itertools.pairwise([horizon, *kept[::-1].tolist()]))
+    # without 1e-6 rounding could add a step to a whole number of steps
+    counts = [max(math.ceil((begin - end) / step - 1e-6), int(begin > end)) for begin, end in ends]
+    return counts, [(begin, end, (begin - end) / max(n, 1)) for (begin, end), n in zip(ends, counts, strict=True)]
+
+
+def _interval(
+    task: March, steps: int, reached: tuple[Field, jax.Array], row: jax.Array
+) -> tuple[tuple[Field, jax.Array], tuple[tuple[jax.Array, ...], dict[str, jax.Array]]]:
+    """Steps from one kept time to the next: V and the flag of no fault, then the slice and the sets of ``contact``.
+
+    Args:
+      task: the constants of the march.
+      steps: the number of steps.
+      reached: V at the beginning of the interval, and true if there was no fault.
+      row: beginning and end of the interval, and the length of its steps.
+    """
+    on, (begin, end, dt) = task.on, row
+    (value, ok), grid = time_stepping.repeat(task, reached[0], begin, dt, steps), task.grid
+    obstacles = task.obstacles_at(end)
+    pair = time_stepping.greedy_actions(task, value, end)
+    if not on.players.exact:  # the result of a search has no derivative of its own, that of a formula has all
+        pair = adjoint.attach_actions(on.at(end), pair, value, jnp.logical_not(obstacles.ended))
+    u, d = (jnp.stack(each, -1) if each else jnp.zeros((*grid.shape, 0), value.dtype) for each in pair)
+    fine = reached[1] & ok & jnp.all(jnp.isfinite(value))
+    return (value, fine), ((value, u, d), contact(task.problem, grid, obstacles, value))
 
 
 def _is_stable(on: Discretisation, method: TimeMethod, horizon: float, step: float) -> jax.Array:

@@ -26,7 +26,7 @@ from jax.tree_util import Partial
 
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.mode_axis import refuse_modes
-from hjbjax.problem.problem import Problem
+from hjbjax.problem.problem import STATIC, Problem
 from hjbjax.problem.pytree import altered, as_partial, front_door, is_traced
 from hjbjax.problem.rewards import costs_of
 from hjbjax.problem.settings import own_settings
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 OF_ACTION = ("drift", "cost", "noise", "growth", "mode_rates", "intensities", "landings", "jump_costs")
 OF_STATE = ("target", "exit_cost", "terminal_cost", "stopping_cost", "running_max", "switching_costs", "push_costs")
 RATES = ("discount", "killing")  # numbers, or functions of the state
+WORDS = ("control_names", "control_units", "inside", "payoff", "value_name", "time_unit")  # not part of a computation
 
 
 def settled(problem: Problem, n: int, dtype: DType | None = None) -> Problem:
@@ -97,15 +98,21 @@ def digest(problem: Problem, n: int) -> str:
         sets = (problem.controls, problem.disturbances)
         # the structure of a set holds its kind, its dimension, and whether the sum of a simplex may be smaller
         kinds = [type(each) if callable(each) else jax.tree.structure(each) for each in sets]
-        account.update(repr((problem.isaacs, *kinds)).encode())
+        chosen = [getattr(problem, name) for name in STATIC if name not in WORDS]
+        account.update(repr((*chosen, *kinds)).encode())
         for leaf in jax.tree.leaves(problem):
-            account.update(np.asarray(leaf, np.float64).tobytes())
+            numbers = np.asarray(leaf, np.float64)
+            # the shape distinguishes the strengths (n,) of separate noises from a matrix (n, 1) of one noise
+            account.update(repr(numbers.shape).encode() + numbers.tobytes())
     return account.hexdigest()
 
 
 def digest_of_program(function: Callable, *arguments: Any) -> str:
-    """A digest of the operations and constants of a function of arrays, the same in every process."""
-    return descriptions.digest_of_jaxpr(jax.make_jaxpr(function)(*arguments))
+    """A digest of the operations and constants of a function of arrays, the same in every process.
+
+    The function is evaluated and not differentiated: derivatives in it are among its operations.
+    """
+    return descriptions.digest_of_jaxpr(jax.make_jaxpr(function)(*arguments), orders=0)
 
 
 def settled_function(function: Callable, *shapes: tuple[int, ...]) -> Partial:
@@ -123,8 +130,8 @@ def opened(function: Any, *arguments: jax.ShapeDtypeStruct) -> Any:
     return function if closed is None or not is_traced(closed.consts) else _with_closure_as_leaves(found, closed)
 
 
-def holds_tracers(thing: object, depth: int = 7) -> bool:
-    """True for traced numbers, and for functions and problems that close over one, at most ``depth`` functions deep."""
+def holds_tracers(thing: object, depth: int = 9) -> bool:
+    """True for traced numbers, and for functions and problems that close over one, at most ``depth`` deep."""
     inside: Iterable[object] = ()
     if isinstance(thing, Partial):
         inside = thing.func, *thing.args, *thing.keywords.values()
@@ -132,9 +139,13 @@ def holds_tracers(thing: object, depth: int = 7) -> bool:
         inside = vars(thing).values()
     elif isinstance(thing, types.FunctionType):
         inside = map(content, thing.__closure__ or ())
-    if depth == 0 or not inside:
+    elif isinstance(thing, dict):  # JAX refuses dictionaries whose keys have no order
+        inside = thing.values()
+    elif isinstance(thing, (list, tuple)):
+        inside = thing
+    else:
         return is_traced(thing)
-    return any(holds_tracers(each, depth - 1) for each in inside)
+    return depth > 0 and any(holds_tracers(each, depth - 1) for each in inside)
 
 
 def refuse_traced(caller: str, *things: object) -> None:

@@ -2,8 +2,9 @@
 
 A jaxpr contains a host function as an object, and a run has a method and a scheme, which a user may have written. A run
 that is resumed in another process has other objects, so they are described by their code and by everything that it
-reads: defaults, closures, globals, attributes, and the functions that it calls. Arrays are described by their bytes,
-because printing rounds and abridges them. Code of installed packages is described by its name.
+reads: defaults, closures, globals, attributes of objects, classes and modules, and the functions that it calls. Arrays
+are described by their bytes, because printing rounds and abridges them. Code of installed packages is described by its
+name.
 
 A jaxpr does not contain the custom derivative rules of its functions either. They are described by the operations of
 the derivatives.
@@ -11,6 +12,7 @@ the derivatives.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import sys
@@ -41,9 +43,14 @@ def digest_of(thing: object) -> str:
     return _hash(_described(thing, {}))
 
 
-def digest_of_jaxpr(closed: jex.ClosedJaxpr) -> str:
-    """A digest of the operations and constants of a jaxpr, of its host functions, and of its derivative rules."""
-    return _hash(_of_program(closed.jaxpr, closed.consts, {}))
+def digest_of_jaxpr(closed: jex.ClosedJaxpr, orders: int = ORDERS) -> str:
+    """A digest of the operations and constants of a jaxpr, of its host functions, and of its derivative rules.
+
+    Args:
+      closed: the jaxpr.
+      orders: the number of times that its function may be differentiated; zero if it is only evaluated.
+    """
+    return _hash(_of_program(closed.jaxpr, closed.consts, {}, orders))
 
 
 def _hash(description: Any) -> str:
@@ -60,7 +67,7 @@ def _described(thing: Any, known: dict[int, tuple[int, Any]]) -> Any:
         thing = thing.function
     if isinstance(thing, PLAIN):
         return repr(thing)
-    if is_traced(thing) and isinstance(thing, jax.Array):  # the host cannot read it, but may use its shape
+    if isinstance(thing, jax.Array) and is_traced(thing):  # the host cannot read it, but may use its shape
         return "traced", str(thing.aval)
     if isinstance(thing, (np.ndarray, np.generic, jax.Array)):
         return _of_array(*bits_of(thing), known)
@@ -81,6 +88,12 @@ def _described(thing: Any, known: dict[int, tuple[int, Any]]) -> Any:
         return "method", _described(thing.__func__, known), _described(thing.__self__, known)
     if isinstance(thing, types.ModuleType):
         return "module", thing.__name__
+    if isinstance(thing, _Reading):
+        return "module", thing.module.__name__, _described(thing.attributes(), known)
+    if isinstance(thing, (staticmethod, classmethod)):
+        return type(thing).__name__, _described(thing.__func__, known)
+    if isinstance(thing, property):
+        return "property", [_described(each, known) for each in (thing.fget, thing.fset, thing.fdel)]
     if id(thing) in known:  # functions may call each other, and objects may hold each other
         return "again", known[id(thing)][0]
     known[id(thing)] = len(known), thing
@@ -98,22 +111,44 @@ def _of_array(array: np.ndarray, dtype: Any, known: dict[int, tuple[int, Any]]) 
     return "array", str(dtype), array.shape, hashlib.blake2b(array.tobytes(), digest_size=16).hexdigest()
 
 
+@dataclasses.dataclass(frozen=True)
+class _Reading:
+    """A module of the user, and the names of the attributes that a function may read from it."""
+
+    module: types.ModuleType
+    names: frozenset[str]
+
+    def attributes(self) -> dict[str, Any]:
+        """The attributes of the module with these names; a module in it has the other names."""
+        own = vars(self.module)
+        return {name: _as_read(own[name], self.names - {name}) for name in sorted(self.names) if name in own}
+
+
+def _as_read(thing: Any, names: frozenset[str]) -> Any:
+    """A module of the user with the attributes of these names; another object unchanged."""
+    own = isinstance(thing, types.ModuleType) and not _is_installed(thing.__name__)
+    return _Reading(thing, names) if own else thing
+
+
 def _read_by(function: types.FunctionType) -> tuple[Any, ...]:
     """The code of a function and the data that it reads besides its arguments."""
     cells = [content(cell) for cell in function.__closure__ or ()]
-    if _is_installed(function.__module__):
-        return function.__module__, function.__qualname__, cells
     known = function.__globals__
-    read = {name: known[name] for name in sorted(names_read(function.__code__)) if name in known}
+    if _is_installed(known.get("__name__")):  # ``functools.wraps`` copies ``__module__`` from another function
+        return function.__module__, function.__qualname__, cells
+    names = frozenset(names_read(function.__code__))
+    read = {name: _as_read(known[name], names) for name in sorted(names) if name in known}
+    cells = [_as_read(each, names) for each in cells]
     return function.__code__, function.__defaults__, function.__kwdefaults__, cells, read
 
 
 def _of_object(thing: Any, known: dict[int, tuple[int, Any]]) -> Any:
-    """The description of another object: its functions if it is a class, otherwise its class and its attributes."""
+    """The description of another object: the attributes of a class, otherwise its class and its attributes."""
     if isinstance(thing, type):
         if _is_installed(thing.__module__):
             return "class", thing.__module__, thing.__qualname__
-        own = {name: each for name, each in vars(thing).items() if isinstance(each, types.FunctionType)}
+        # of the other attributes with such names Python makes most, such as the documentation and the annotations
+        own = {n: each for n, each in vars(thing).items() if n[:2] != "__" or isinstance(each, types.FunctionType)}
         return "class", thing.__qualname__, [_described(each, known) for each in (own, thing.__bases__)]
     if type(thing).__reduce__ is not object.__reduce__ and (kept := _kept_by_pickle(thing)) is not None:
         return "object", _described(kept, known)

@@ -91,6 +91,30 @@ def test_the_file_of_another_fit_is_refused(change, word, tmp_path):
         hjb.fit(**options | change, checkpoint=tmp_path / "fit.npz", resume=True)
 
 
+def test_a_setting_of_random_numbers_is_part_of_the_fit(tmp_path):
+    """The same key has other numbers, so the two halves of a run would belong to two losses."""
+
+    def loss(p):
+        return jnp.sum((p["a"] - jax.random.normal(jax.random.key(0), (2,))) ** 2)
+
+    hjb.fit(loss, {"a": 1.0}, steps=2, checkpoint=tmp_path / "fit.npz")
+    for other in (jax.threefry_partitionable(not jax.config.jax_threefry_partitionable), jax.default_prng_impl("rbg")):
+        with other, pytest.raises(hjb.FileError, match="made for another (loss or .*)?setting of random numbers; give"):
+            hjb.fit(loss, {"a": 1.0}, steps=2, checkpoint=tmp_path / "fit.npz", resume=True)
+
+
+def test_the_first_state_of_the_optimiser_is_part_of_the_fit(tmp_path):
+    """It is not an operation of a step."""
+    fits = [
+        {"optimiser": optax.adagrad(0.1, initial_accumulator_value=first), "checkpoint": tmp_path / "fit.npz"}
+        for first in (0.1, 0.5)
+    ]
+    hjb.fit(waves, START, steps=2, **fits[0])
+    hjb.fit(waves, START, steps=2, resume=True, **fits[0])
+    with pytest.raises(hjb.FileError, match="made for another first state of the optimiser; give"):
+        hjb.fit(waves, START, steps=2, resume=True, **fits[1])
+
+
 def test_other_names_of_the_parameters_are_another_fit(tmp_path):
     hjb.fit(lambda p: p["a"] ** 2, {"a": 1.0}, steps=2, checkpoint=tmp_path / "fit.npz")
     with pytest.raises(hjb.FileError, match="made for another structure of the parameters; give"):

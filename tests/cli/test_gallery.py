@@ -257,3 +257,15 @@ def test_the_double_integrator_switches_once():
     path = run_folder.closed_path(problem, solution, entry.start, entry.duration, True, None)
     assert np.count_nonzero(np.diff(path.controls[:, 0])) == 1
     assert float(path.cost) == pytest.approx(1 - np.exp(-2.0), abs=1e-3)
+
+
+def test_a_name_that_is_too_long_is_refused_in_words():
+    """pathlib raises the bare error of the system."""
+    name = "a" * 300
+    found = CliRunner().invoke(main, ["gallery", "--out", name])
+    assert found.exit_code == 2
+    assert f"--out: {name} cannot be written: File name too long; give another folder" in found.output
+    found = CliRunner().invoke(main, ["solve", "bang-bang", "--out", "free", "--checkpoint", name])
+    assert found.exit_code == 5
+    assert "cannot be written: File name too long" in found.output
+    assert "Errno" not in found.output

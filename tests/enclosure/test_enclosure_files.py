@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from forged_headers import header_of, write_header
 from pictures import pictures as plotting
 
 import hjbjax as hjb
@@ -43,8 +44,31 @@ def test_an_enclosure_is_read_from_its_file_bit_by_bit(found, plane, tmp_path):
         assert (again.status, again.message, again.stats) == (each.status, each.message, each.stats)
     with pytest.raises(FileExistsError):
         found.save(path)
-    with pytest.raises(FileError, match="another program"):
+    with pytest.raises(FileError, match="another kind, hjbjax.Solution, wanted hjbjax.Enclosure"):
         hjb.Enclosure.load(_foreign(tmp_path))
+
+
+@pytest.mark.parametrize("kind", ["found", "tubes"])
+def test_every_entry_of_a_header_is_checked(kind, request, tmp_path):
+    """A level that was text failed in ``print``, far from the file."""
+    made = request.getfixturevalue(kind)
+    one, path = made[0] if kind == "tubes" else made, tmp_path / "run.npz"
+    one.save(path)
+    header, kinds = header_of(path), type(one).KINDS
+    assert set(header) == {*kinds, "format", "version", "arrays"}
+    for name in kinds:
+        for wrong in (True, 7, 0.5, "word", None, [], {}):
+            if type(wrong) not in kinds[name]:
+                write_header(path, {**header, name: wrong})
+                with pytest.raises(FileError, match=f"its header has {name} = "):
+                    type(one).load(path)
+        write_header(path, {key: each for key, each in header.items() if key != name})
+        with pytest.raises(FileError, match=f"its header has no '{name}'"):
+            type(one).load(path)
+        for part in header["grid"] if name == "grid" else ():
+            write_header(path, {**header, "grid": {**header["grid"], part: 7}})
+            with pytest.raises(FileError, match="cannot be read: "):
+                type(one).load(path)
 
 
 def _foreign(folder):
@@ -85,7 +109,7 @@ def test_a_tube_is_read_from_its_file_bit_by_bit(tubes, tmp_path):
         assert repr(again.grid) == repr(each.grid)
         for name in ("level", "is_free", "message", "stats", "above"):
             assert getattr(again, name) == getattr(each, name)
-    with pytest.raises(FileError, match="another program"):
+    with pytest.raises(FileError, match="another kind, hjbjax.Solution, wanted hjbjax.TubeEnclosure"):
         hjb.TubeEnclosure.load(_foreign(tmp_path))
 
 

@@ -245,7 +245,7 @@ def test_what_stands_in_the_way_is_said_before_anything_is_computed(tmp_path):
     with pytest.raises(ValueError, match=r"Checkpoint: every = 0; wanted a finite number > 0, in seconds"):
         hjb.Checkpoint("run", every=0)
     hjb.solve(posed(), LINE, checkpoint=tmp_path / "other")  # which is no solution
-    with pytest.raises(hjb.FileError, match="does not say 'hjbjax.Solution'"):
+    with pytest.raises(hjb.FileError, match="another kind, hjbjax.Checkpoint, wanted hjbjax.Solution"):
         hjb.load(tmp_path / "other.npz")
 
 

@@ -11,6 +11,7 @@ import zipfile
 import numpy as np
 import pytest
 from counted_reads import counted_reads
+from forged_headers import header_of, npy, write_header
 
 import hjbjax as hjb
 from hjbjax.calibration.optimisation import Fit
@@ -124,12 +125,6 @@ def forged(data, draw, mark):
     return made.getvalue()
 
 
-def npy(array):
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
-
-
 def modes(path):
     grid = with_modes(hjb.Grid([-1.0], [1.0], (3,)), ("low", "high"))
     hjb.Solution(grid, np.zeros(grid.shape), None, code=hjb.Status.CONVERGED).save(path)
@@ -149,14 +144,95 @@ def fit(path):
 
 def network(path):
     weights = ((np.ones((1, 2)), np.zeros(2)), (np.ones((2, 1)), np.zeros(1)))
-    header = {"ansatz": "RestAnsatz", "fields": [], "layers": 2, "format": NeuralSolution.FORMAT}
+    number, row, square = np.ones(()), np.ones(1), np.ones((1, 1))
+    fields = {"state": row, "costate": row, "value": number, "matrix": square, "norm": square, "size": row}
+    header = {
+        "ansatz": "RestAnsatz", "fields": list(fields), "layers": 2, "format": NeuralSolution.FORMAT, "quadratic": True,
+        "status": 0, "validation": {"residual": 0.5}, "seconds": 1.0,
+    }  # fmt: skip
     arrays = {
         f"{name}{i}": each
         for i, pair in enumerate(weights)
         for name, each in zip(("matrix", "bias"), pair, strict=True)
     }
-    files.write(path, {**header, "version": 1}, {**arrays, "lo": np.zeros(1), "hi": np.ones(1), "history": np.ones(1)})
+    ends = {"lo": np.zeros(1), "hi": np.ones(1), "history": np.ones(1)}
+    files.write(path, {**header, "version": 1}, {**arrays, **fields, **ends})
     return NeuralSolution.load
+
+
+def blocks(path):
+    """A sum of a function of one state and a function of two others."""
+    grids = hjb.Grid([-1.0], [1.0], (3,)), hjb.Grid([-1.0] * 2, [1.0] * 2, (3, 4))
+    parts = tuple(hjb.Solution(each, np.ones(each.shape), np.ones((*each.shape, 1))) for each in grids)
+    hjb.BlockSolution(parts, "sum", None, ((1,), (0, 2)), ((0,), (1,)), ((), ()), count=3).save(path)
+    return hjb.BlockSolution.load
+
+
+def test_the_files_of_these_tests_are_read(tmp_path):
+    for make in (modes, hopf, fit, network, blocks):
+        make(tmp_path / f"{make.__name__}.npz")(tmp_path / f"{make.__name__}.npz")
+    assert hjb.BlockSolution.load(tmp_path / "blocks.npz").control_at([0.1, 0.2, 0.3]).tolist() == [1.0, 1.0]
+    assert np.isfinite(NeuralSolution.load(tmp_path / "network.npz").value_at([0.5]))
+
+
+@pytest.mark.parametrize("make", [hopf, fit, network, blocks])
+def test_every_entry_of_a_header_is_checked(make, tmp_path):
+    """Otherwise a look at the result raises KeyError or TypeError, far from the file."""
+    path = tmp_path / "run.npz"
+    load = make(path)
+    header, kinds = header_of(path), load.__self__.KINDS
+    assert set(header) == {*kinds, "format", "version", "arrays"}
+    for name in kinds:
+        write_header(path, {key: each for key, each in header.items() if key != name})
+        with pytest.raises(hjb.FileError, match=f"its header has no '{name}': it is damaged, or of an older format"):
+            load(path)
+        for wrong in (True, 7, 0.5, "word", None, [], {}):
+            if type(wrong) not in kinds[name]:
+                write_header(path, {**header, name: wrong})
+                with pytest.raises(
+                    hjb.FileError, match=f"its header has {name} = .*, wanted {kinds[name][0].__name__}"
+                ):
+                    load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "part"),
+    [
+        ("rule", "mean", "rule is 'mean', wanted one of"),
+        ("bound", "inner", "bound is 'inner', wanted one of"),
+        ("states", [[1]], "its 2 blocks have states"),
+        ("states", [[1], 2], "its 2 blocks have states"),
+        ("states", [[1], [0]], "a block of 2 states has the numbers"),
+        ("states", [[1], [0, 3]], "a block of 2 states has the numbers"),
+        ("states", [[1], [0, -1]], "a block of 2 states has the numbers"),
+        ("states", [[1], [0, True]], "a block of 2 states has the numbers"),
+        ("controls", [[0, 1], [1]], "a block of 1 controls has the numbers"),
+        ("controls", [[0], [10**30]], "a block of 1 controls has the numbers"),
+        ("disturbances", [[]], "its 2 blocks have disturbances"),
+        ("count", 0, "its 2 blocks have states"),
+        ("count", 10**30, "its 2 blocks have states"),
+        ("parts", [], "does not hold the arrays|unknown entry"),
+    ],
+)
+def test_blocks_that_do_not_fit_are_refused(name, wrong, part, tmp_path):
+    path = tmp_path / "run.npz"
+    load = blocks(path)
+    write_header(path, {**header_of(path), name: wrong})
+    with pytest.raises(hjb.FileError, match=f"cannot be read: .*({part})"):
+        load(path)
+
+
+@pytest.mark.parametrize("name", ["lo", "hi", "matrix0", "bias0", "matrix1", "bias1", "state", "norm", "value"])
+def test_arrays_of_a_network_that_do_not_fit_are_refused(name, tmp_path):
+    path = tmp_path / "run.npz"
+    load = network(path)
+    with zipfile.ZipFile(path) as source:
+        content = {each: source.read(each) for each in source.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for each, member in content.items():
+            archive.writestr(each, npy(np.ones(3)) if each == f"{name}.npy" else member)
+    with pytest.raises(hjb.FileError, match="cannot be read: its (array|network)"):
+        load(path)
 
 
 @pytest.mark.parametrize(
@@ -164,8 +240,8 @@ def network(path):
     [
         (modes, ("grid", "modes"), ["low", 7], "modes are .* wanted text"),
         (modes, ("grid", "modes"), [None, "high"], "modes are .* wanted text"),
-        (hopf, ("horizon",), None, "not .NoneType"),
-        (hopf, ("horizon",), "soon", "convert string"),
+        (hopf, ("horizon",), None, "horizon = None, wanted float"),
+        (hopf, ("horizon",), "soon", "horizon = 'soon', wanted float"),
         (fit, ("names",), [None], "names of parameters are .* wanted text"),
         (network, ("layers",), 10**30, "arrays cannot be 1000"),
         (
@@ -180,16 +256,11 @@ def test_a_header_with_another_kind_of_entry_is_refused(make, keys, wrong, part,
     """Also if only a look at the result would fail."""
     path = tmp_path / "run.npz"
     load = make(path)
-    with zipfile.ZipFile(path) as source:
-        content = {name: source.read(name) for name in source.namelist()}
-    table = header = json.loads(np.load(io.BytesIO(content["header.npy"])).tobytes())
+    table = header = header_of(path)
     for key in keys[:-1]:
         table = table[key]
     table[keys[-1]] = wrong
-    content["header.npy"] = npy(np.frombuffer(json.dumps(header).encode(), np.uint8))
-    with zipfile.ZipFile(path, "w") as archive:
-        for each, member in content.items():
-            archive.writestr(each, member)
+    write_header(path, header)
     with pytest.raises(hjb.FileError, match=f"cannot be read: .*{part}"):
         load(path)
 

@@ -1,6 +1,8 @@
 """The exported feedback: the same answers with NumPy only, from a copy of one file."""
 
 import dataclasses
+import json
+import os
 import shutil
 import subprocess
 import sys
@@ -176,6 +178,69 @@ def test_a_damaged_file_is_refused_as_documented_or_says_the_same(tmp_path):
         numpy_feedback.load(damaged)
     with pytest.raises(FileNotFoundError):
         numpy_feedback.load(tmp_path / "nowhere.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "part"),
+    [
+        ("control", np.ones(3), "control is float64 of shape"),
+        ("value", np.ones((5, 7)), "value is float64 of shape"),
+        ("value", np.ones(35, int), "value is int64"),
+        ("periodic", np.zeros(2), "periodic is float64"),
+        ("nodes1", np.ones(9), "value is float64 of shape"),
+        ("enumerated", np.zeros(1, bool), "enumerated is bool of shape"),
+        ("lo", np.zeros(3), "lo is float64 of shape"),
+        ("more", np.zeros(3), "its header lists"),
+    ],
+)
+def test_arrays_that_do_not_fit_each_other_are_refused(name, wrong, part, tmp_path):
+    """A feedback loop would fail later, at a state whose cell reads them."""
+    path = tmp_path / "feedback.npz"
+    CASES["mean"][0].export(path)
+    with np.load(path) as file:
+        content = dict(file)
+    assert {"control", "value", "lo"} < set(content)
+    np.savez(path, **{**content, name: wrong})
+    with pytest.raises(ValueError, match=rf"feedback\.npz: damaged, or not .*{part}"):
+        numpy_feedback.load(path)
+    np.savez(path, **content)
+    assert numpy_feedback.load(path).names == CASES["mean"][0].grid.names
+
+
+def test_a_file_that_claims_more_bytes_than_it_has_is_refused(tmp_path):
+    """A few kilobytes may unpack to gigabytes."""
+    path = tmp_path / "feedback.npz"
+    CASES["mean"][0].export(path)
+    with np.load(path) as file:
+        content = dict(file)
+    np.savez_compressed(path, **{**content, "value": np.zeros((1000, 1000))})
+    with pytest.raises(ValueError, match="it claims 8[0-9]* bytes of arrays and is"):
+        numpy_feedback.load(path)
+
+
+def test_a_folder_and_a_pipe_are_refused(tmp_path):
+    """Opening a pipe waits for a writer."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe: damaged, or not .*it is not an ordinary file"):
+        numpy_feedback.load(tmp_path / "pipe")
+    with pytest.raises(IsADirectoryError):
+        numpy_feedback.load(tmp_path)
+
+
+def test_a_refusal_is_one_short_line(tmp_path):
+    path = tmp_path / "feedback.npz"
+    CASES["mean"][0].export(path)
+    for key in ("format", "arrays"):
+        with np.load(path) as file:
+            content = dict(file)
+        header = json.loads(content["header"].tobytes())
+        long = ["x\n" * 5000, *header[key]] if key == "arrays" else "x" * 5000
+        content["header"] = np.frombuffer(json.dumps({**header, key: long}).encode(), np.uint8)
+        np.savez(tmp_path / "long.npz", **content)
+        with pytest.raises(ValueError, match=r"long\.npz: ") as refused:
+            numpy_feedback.load(tmp_path / "long.npz")
+        assert len(str(refused.value).splitlines()) == 1
+        assert len(str(refused.value)) < 600
 
 
 @pytest.mark.slow

@@ -74,3 +74,35 @@ def test_a_searched_control_has_the_derivative_of_the_value():
         wanted = (run(1.0 + 1e-4) - run(1.0 - 1e-4)) / 2e-4
     assert np.min(np.abs(wanted)) > 0.1
     np.testing.assert_allclose(found, wanted, rtol=1e-3)
+
+
+def kept_at(times, weight):
+    """A march with these kept times, of functions of time."""
+    problem = hjb.Problem(
+        lambda t, x, u: u + t, lambda t, x, u: x @ x + u @ u, hjb.Box([-3.0], [3.0]), time_dependent=True,
+        stopping_cost=lambda t, x: 0.2 + t, terminal_cost=lambda t, x: weight * x @ x,
+    )  # fmt: skip
+    grid = hjb.Grid([-1.0], [1.0], (9,))
+    return hjb.march(problem, grid, 1.0, step=0.02, scheme=hjb.Upwind(split=True), times=times)
+
+
+def test_slices_at_uneven_times_equal_those_of_the_host():
+    """One loop covers the intervals of equal steps: here of 5, 5, 3, 3 and 0 steps, and of 34 steps to the horizon."""
+    with jax.enable_x64(True):
+        for times in ([0.0, 0.1, 0.2, 0.26, 0.32], [0.0, 0.1, 0.9, 1.0]):
+            host = kept_at(times, 2.0)
+            traced = jax.jit(functools.partial(kept_at, times))(2.0)
+            assert int(traced.steps) == int(host.steps)
+            for name in ("times", "value", "policy", "stopping"):
+                np.testing.assert_allclose(getattr(traced, name), getattr(host, name), atol=1e-12, err_msg=name)
+
+
+def test_more_kept_times_do_not_make_a_longer_program():
+    """A program per interval took 40 s of one core to compile for 41 kept times, which fit_trajectories uses."""
+
+    def length(count):
+        slope = jax.grad(lambda weight: jnp.sum(kept_at(np.linspace(0, 1, count), weight).policy))
+        return len(str(jax.make_jaxpr(slope)(2.0)).splitlines())
+
+    with jax.enable_x64(True):
+        assert length(41) == length(6)

@@ -13,6 +13,8 @@ from scipy.interpolate import CubicSpline
 
 import hjbjax as hjb
 from hjbjax.discretisation import posing
+from hjbjax.problem.problem import STATIC
+from hjbjax.problem.pytree import altered
 from hjbjax.tracing import closures
 from hjbjax.tracing.descriptions import digest_of
 from hjbjax.tracing.outside import fingerprint, identity, unnested
@@ -743,7 +745,42 @@ def read_through_a_global(x):
     return SHARED["gain"] * np.asarray(x)
 
 
+class Fixed:
+    """A class whose attributes a host function reads."""
+
+
+def with_attribute(attribute):
+    """A host function that reads an attribute of a class, through an object of a derived class."""
+    made = type("Own", (type("Base", (Fixed,), {"gain": attribute}),), {})()
+    return lambda x: (made.gain() if callable(made.gain) else made.gain) * np.asarray(x)
+
+
+def with_module(gain):
+    """A host function that reads a number from a module inside a module."""
+    outer, outer.inner = types.ModuleType("outer"), types.ModuleType("outer.inner")
+    outer.inner.gain = gain
+    return types.FunctionType((lambda x: outer.inner.gain * np.asarray(x)).__code__, {"np": np}, closure=(cell(outer),))
+
+
+def cell(held):
+    return (lambda: held).__closure__[0]
+
+
+def wrapping(gain):
+    """A host function with the name and the documentation of a function of NumPy."""
+    return functools.wraps(np.sinc)(lambda x: gain * np.asarray(x))
+
+
 HELD = {
+    "attribute": (lambda: with_attribute(1.0), lambda: with_attribute(2.0)),
+    "property": (lambda: with_attribute(property(lambda _: 1.0)), lambda: with_attribute(property(lambda _: 2.0))),
+    "static": (lambda: with_attribute(staticmethod(lambda: 1.0)), lambda: with_attribute(staticmethod(lambda: 2.0))),
+    "of a class": (
+        lambda: with_attribute(classmethod(lambda _: 1.0)),
+        lambda: with_attribute(classmethod(lambda _: 2.0)),
+    ),
+    "module": (lambda: with_module(1.0), lambda: with_module(2.0)),
+    "wrapping": (lambda: wrapping(Gain(1.0)), lambda: wrapping(Gain(2.0))),
     "object": (lambda: Gain(1.0), lambda: Gain(2.0)),
     "closure": (lambda: times_gain(1.0), lambda: times_gain(2.0)),
     "table": (lambda: interpolated(TABLE), lambda: interpolated(NEARLY)),
@@ -776,6 +813,23 @@ def test_a_digest_contains_the_globals_of_a_host_function(monkeypatch):
     first = digest_with(read_through_a_global)
     monkeypatch.setitem(SHARED, "gain", 2.0)
     assert digest_with(read_through_a_global) != first
+
+
+def test_a_function_may_close_over_a_dictionary_whose_keys_have_no_order():
+    table = {1: [2.0], "a": {2: 3.0, "b": 4.0}}
+    assert not closures.holds_tracers(lambda x: table[1][0] * x)
+    endless = {1: 2.0}
+    endless["itself"] = endless
+    assert not closures.holds_tracers(lambda x: endless["itself"][1] * x)
+    assert digest_of(lambda x: table["a"]["b"] * x) == digest_of(lambda x: table["a"]["b"] * x)
+    found = []
+    jax.jit(lambda a: found.append(closures.holds_tracers(lambda x: {**table, 2: {"c": [a]}}[2]["c"][0] * x)) or a)(1.0)
+    jax.jit(lambda a: found.append(closures.holds_tracers(nested({**table, 2: {"c": [a]}}))) or a)(1.0)
+    assert found == [True, True]
+
+
+def nested(held):
+    return lambda x: held[2]["c"][0] * x
 
 
 def with_forward_rule(slope):
@@ -811,6 +865,66 @@ def test_a_digest_contains_the_derivative_rules_of_functions(ruled):
 
     assert digest(1.0) == digest(1.0)
     assert digest(1.0) != digest(2.0)
+
+
+def test_the_rules_of_a_program_that_is_not_differentiated_are_not_followed():
+    """A step of a fit has its derivatives among its operations; third ones of it took minutes."""
+    followed = []
+    same = jax.custom_jvp(lambda u: u)
+    same.defjvp(lambda primals, tangents: followed.append(1) or (same(primals[0]), tangents[0]))
+    assert closures.digest_of_program(same, 1.0) == closures.digest_of_program(same, 2.0)
+    assert not followed
+    closures.digest_of_program(jax.grad(same), 1.0)
+    assert followed
+
+
+PLANE = hjb.Box([-1.0] * 2, [1.0] * 2)
+
+
+def flat(x, u):
+    return u
+
+
+SIMILAR = {
+    "one noise": lambda: hjb.Problem(flat, square, PLANE, discount=1.0, noise=[[0.1], [0.2]]),
+    "separate noises": lambda: hjb.Problem(flat, square, PLANE, discount=1.0, noise=[0.1, 0.2]),
+    "push up": lambda: hjb.Problem(flat, square, PLANE, discount=1.0, pushes=[hjb.Push([0.0, 1.0], 1.0)]),
+    "push down": lambda: hjb.Problem(flat, square, PLANE, discount=1.0, pushes=[hjb.Push([0.0, -1.0], 1.0)]),
+    "push along": lambda: hjb.Problem(flat, square, PLANE, discount=1.0, pushes=[hjb.Push([1.0, 0.0], 1.0)]),
+    "two": lambda: hjb.Problem(
+        flat, square, PLANE, discount=1.0, pushes=[hjb.Push([1.0, 0.0], 1.0), hjb.Push([0.0, 1.0], 1.0)]
+    ),
+}
+
+
+@pytest.mark.slow
+def test_problems_whose_numbers_mean_something_else_have_other_digests(tmp_path):
+    """A resumed solve returned the finished value of a push along another axis as that of this one."""
+    grid = hjb.Grid([-1.0] * 2, [1.0] * 2, (5, 5))
+    hjb.solve(SIMILAR["push up"](), grid, checkpoint=tmp_path / "run.npz")
+    for name, each in SIMILAR.items():
+        if name == "push up":
+            hjb.solve(each(), grid, checkpoint=tmp_path / "run.npz", resume=True)
+            continue
+        with pytest.raises(hjb.FileError, match="made for another problem; give"):
+            hjb.solve(each(), grid, checkpoint=tmp_path / "run.npz", resume=True)
+    digests = {closures.digest(closures.settled(SIMILAR[name](), 2), 2) for name in ("one noise", "separate noises")}
+    assert len(digests) == 2
+
+
+def test_every_choice_in_a_problem_is_part_of_its_digest():
+    """Except words that no computation uses; a new field must be added to one of the two."""
+    assert set(closures.WORDS) < set(STATIC)
+    words = {"control_names": ("left",), "control_units": ("N",), "inside": "above", "payoff": "reward",
+             "value_name": "W", "time_unit": "s"}  # fmt: skip
+    assert set(words) == set(closures.WORDS)
+    problem = closures.settled(hjb.Problem(flat, square, UNIT, discount=1.0), 1)
+    plain = closures.digest(problem, 1)
+    assert closures.digest(altered(problem, **words), 1) == plain
+    others = {"isaacs": "lower", "discounted": None, "push_steps": ((0, 1),)}
+    assert {*others, *words, "time_dependent"} == set(STATIC)
+    for name, value in others.items():
+        assert closures.digest(altered(problem, **{name: value}), 1) != plain
 
 
 @pytest.mark.slow

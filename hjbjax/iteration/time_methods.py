@@ -15,7 +15,7 @@ Explicit: strong-stability-preserving Runge–Kutta methods of Shu and Osher, wi
 of order 1, 2, 3 and 3 in time. Each stage is a mean of Euler steps and preserves what an Euler step preserves: after
 every stage V ← max(g, min(ψ, ·)) and the prescribed values, and for the monotone chain the order of two values and the
 range of the data, if c S e^{βΔt} (max Q + β) ≤ 1, with Q the rate at which the chain leaves a node. Euler's step does
-not require the factor e^{βΔt}. Slopes of higher order are up to 1.5 times as steep as those of the chain. Where Euler
+not require the factor e^{βΔt}. Slopes of higher order are up to 1.5 times as steep as in the chain. Where Euler
 steps follow one another without a mean, as with 1 and with 4 stages, Q is then the rate for 1.5 times the drift. A
 custom ``Tableau`` is passed to ``Explicit(stages=...)``.
 
@@ -221,7 +221,7 @@ class Explicit(TimeMethod):
       stages: 1 (Euler), 2 or 3, which is also the order in time; 4, of order 3 with longer steps; a custom
         ``Tableau``; or ``None`` for the choice of the scheme: 1 for ``Upwind``, 3 for ``Weno5``, else 2. With 4 stages
         the steps are twice as long with ``Upwind`` and where noise dominates, which takes two thirds of the
-        evaluations of 3. Otherwise they are 1.3 times as long, with as many evaluations as 3.
+        evaluations of 3. Otherwise they are 1.3 times as long, and it takes about the evaluations of 3.
       fraction: the step in units of the stability limit, at most 1. The limit is 1/(max Q + β), or twice that with 4
         stages. With 1 and 4 stages the drift counts 1.5 times, except with ``Upwind``.
     """

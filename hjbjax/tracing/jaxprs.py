@@ -152,7 +152,7 @@ def closed(jaxpr: jex.Jaxpr) -> jex.ClosedJaxpr:
 
 
 def in_use(found: jex.ClosedJaxpr) -> jex.ClosedJaxpr:
-    """A jaxpr with constants of its own in JAX's default types.
+    """A jaxpr with separate constants in JAX's default types.
 
     JAX 0.10 converts a NumPy array once and returns the converted array again as long as something holds it, in 32 bits
     as in 64. A jaxpr that is kept must therefore not hold it.

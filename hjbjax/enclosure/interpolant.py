@@ -13,7 +13,7 @@ bound of their rounding errors is added: the largest node value times a number t
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -235,25 +235,33 @@ class Cells:
         n = len(self.rows)
         values, largest = with_largest(values)
         found: dict[tuple[int, ...], tuple[Interval, Interval]] = {}
-
-        def walk(axis: int, orders: tuple[int, ...], whole: np.ndarray, middle: np.ndarray) -> None:
-            if axis == n:
-                whole, middle = whole.reshape(-1, *whole.shape[n:]), middle.reshape(middle.shape[n:])
-                error = largest * self._error(orders)
-                axes = tuple(k for k, order in enumerate(orders) for _ in range(order))
-                ranges = Interval(whole.min(axis=0) - error, whole.max(axis=0) + error)
-                found[axes] = ranges, Interval(middle - error, middle + error)
-                return
-            for order in range(min(POINTS, 4 - sum(orders))):
-                rows, middles = self.rows[axis][order], self.middles[axis][order]
-                walk(axis + 1, (*orders, order), _contracted(rows, whole), _contracted(middles, middle))
-
         stencil = values[self.stencil]
-        walk(0, (), stencil, stencil)
+        for orders, whole, middle in self._contractions(stencil, stencil):
+            whole, middle = whole.reshape(-1, *whole.shape[n:]), middle.reshape(middle.shape[n:])
+            error = largest * self._error(orders)
+            axes = tuple(k for k, order in enumerate(orders) for _ in range(order))
+            ranges = Interval(whole.min(axis=0) - error, whole.max(axis=0) + error)
+            found[axes] = ranges, Interval(middle - error, middle + error)
         zero = np.zeros(())
         for axis in range(n):
             found[axis, axis, axis] = (Interval(zero, zero),) * 2
         return found
+
+    def _contractions(
+        self, whole: np.ndarray, middle: np.ndarray, orders: tuple[int, ...] = ()
+    ) -> Iterator[tuple[tuple[int, ...], np.ndarray, np.ndarray]]:
+        """Per order along every axis, at most three in all, the Bézier coefficients of the derivative and its centre.
+
+        A method, because a local function that calls itself is a cycle, which keeps the arrays of its cells until the
+        garbage collector runs.
+        """
+        axis = len(orders)
+        if axis == len(self.rows):
+            yield orders, whole, middle
+            return
+        for order in range(min(POINTS, 4 - sum(orders))):
+            rows, middles = self.rows[axis][order], self.middles[axis][order]
+            yield from self._contractions(_contracted(rows, whole), _contracted(middles, middle), (*orders, order))
 
     def _error(self, orders: Sequence[int]) -> np.ndarray:
         """A bound of the error of a coefficient of a derivative for node values up to one, shape (count,)."""

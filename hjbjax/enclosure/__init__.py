@@ -6,6 +6,7 @@ the Hamiltonian of two. ``defect`` is the defect of the equation over every cell
 ``correction`` changes node values so that the defect falls. ``walls`` bounds the influence of the ends of the box, and
 ``exits`` describes the target between the nodes. ``levels`` makes functions of the candidate that are bounds, and
 ``bounds`` is the result with its files. ``discounted``, ``branches`` (at kinks) and ``undiscounted`` find the bounds
-for ``enclose``. ``tube_levels`` has the conditions on the levels of a spline that bounds a tube, for ``enclose_tube``
-in ``tubes``. ``checks`` refuses problems without a proof.
+for ``enclose``. ``tube_levels`` has the conditions on the levels of a spline that bounds a tube, ``tube_search`` finds
+these levels, and ``tube_branches`` has further splines for edges, for ``enclose_tube`` in ``tubes``. ``checks`` refuses
+problems without a proof.
 """

@@ -33,10 +33,6 @@ from hjbjax.tracing import taylor_forms as tf
 from hjbjax.tracing.intervals import EPS, quietly
 from hjbjax.tracing.taylor_forms import Form
 
-UP = 1 + 1e-12  # more than the rounding of a few products and sums
-TRIALS = 100  # guesses of the rise of the level in one time slab
-MORE = 1.01  # a guess exceeds the rise that the last one required by this factor
-
 
 def steady_drift(drift: Callable, z: Array, *inputs: Array) -> Array:
     """The drift of (t, x) for a drift that does not depend on time."""
@@ -99,6 +95,10 @@ class TubeTask:
             drift, None, problem.controls, disturbances=problem.disturbances, isaacs=problem.isaacs
         )  # fmt: skip
         return cls(problem, moving, mesh, Spline.on(mesh), spline_coefficients(values, mesh))
+
+    def with_values(self, values: np.ndarray) -> "TubeTask":
+        """The same data for other node values (k, *grid)."""
+        return dataclasses.replace(self, values=spline_coefficients(values, self.mesh))
 
     def obstacles(self, z: list[Form]) -> tuple[list[tuple[Form | None, Form | None]], Form]:
         """The obstacles that help and hinder each side, ``None`` if there is none, and V at the horizon."""
@@ -186,67 +186,14 @@ class TubeTask:
             excess = (w - end if side == 0 else end - w).bounds(cells.radii).hi
             own, range_ = end.bounds(cells.radii), w.bounds(cells.radii)
             low, high = (own.lo, range_.hi) if side == 0 else (-own.hi, -range_.lo)
-            bound = _above(np.minimum(high, level + excess))
+            bound = above(np.minimum(high, level + excess))
             needed = max(needed, float(np.max(np.where(low < level, bound, -np.inf))))
         return needed
 
-    @quietly
-    def threshold(self, found: Sides, ranges: tuple[np.ndarray, np.ndarray], level: float, side: int) -> np.ndarray:
-        """σ at the beginning of every time slab and at the horizon, with the sign of the side; infinite if unknown.
 
-        Args:
-          found: the conditions of the cells.
-          ranges: the ranges of the obstacles.
-          level: v, with the sign of the side.
-          side: 0 for the lower and 1 for the upper side.
-        """
-        count = self.spline.shape[0]
-        pair = (found.least, found.most) if side == 0 else (-found.most, -found.least)
-        lo, hi, rate, helper, hinder, helped, hindered = (
-            each.reshape(count, -1)
-            for each in (*pair, *(all_[side] for all_ in (found.rate, found.helper, found.hinder, *ranges)))
-        )
-        table = self.spline.tables[0]
-        edges = np.concatenate([table.at[:1], table.between, table.at[-1:]])
-        path = np.full(count + 1, np.inf)
-        # a level below all W is as good as any lower one
-        path[count] = max(self.at_horizon(level, side), 2 * float(np.min(lo)) - float(np.max(hi)))
-        for k in range(count - 1, -1, -1):
-            must = np.where(hindered[k] < level, _above(np.minimum(hi[k], level + hinder[k])), -np.inf)
-            now = max(float(path[k + 1]), float(np.max(must)))
-            # where the obstacle that helps is at least v nothing is required
-            helps = (helped[k] >= level) | (helper[k] <= _below(now - level))
-            near = (hi[k] >= now) & ~helps
-            path[k] = _passed(lo[k][near], rate[k][near], now, (edges[k + 1] - edges[k]) * UP)
-        return path
-
-
-def _passed(lo: np.ndarray, rate: np.ndarray, now: float, duration: float) -> float:
-    """The level before a time slab, from the level after it.
-
-    Args:
-      lo: the least W, with the sign of the side, of the cells that reach the level after the slab.
-      rate: their rates.
-      now: the level after the slab.
-      duration: the length of the slab.
-    """
-    rise = 0.0
-    for _ in range(TRIALS):
-        fastest = float(np.max(rate[lo <= _above(now + rise)], initial=0.0))
-        if duration * fastest * UP <= rise:
-            return float(_above(now + rise))
-        rise = duration * fastest * UP * MORE
-        if not np.isfinite(rise):
-            break
-    return np.inf
-
-
-def _above(x: Any) -> Any:
+def above(x: Any) -> Any:
+    """The next larger number."""
     return np.nextafter(x, np.inf)
-
-
-def _below(x: Any) -> Any:
-    return np.nextafter(x, -np.inf)
 
 
 def _either(join: Callable[[Form, Form], Form], left: Form | None, right: Form | None) -> Form | None:

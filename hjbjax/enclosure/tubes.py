@@ -10,7 +10,9 @@ import numpy as np
 from hjbjax.enclosure import checks
 from hjbjax.enclosure.bounds import evaluate_in_box, spline_arrays, spline_of
 from hjbjax.enclosure.interpolant import LARGEST, Spline
-from hjbjax.enclosure.tube_levels import Sides, TubeTask
+from hjbjax.enclosure.tube_branches import branches, vertices
+from hjbjax.enclosure.tube_levels import TubeTask
+from hjbjax.enclosure.tube_search import WIDER, Candidate, LevelSearch, largest_least
 from hjbjax.problem import arguments
 from hjbjax.problem.grid import Grid
 from hjbjax.problem.problem import Problem, is_discounted
@@ -26,8 +28,6 @@ from hjbjax.tracing.operations import operations
 from hjbjax.tracing.taylor_forms import traced
 
 FEWEST = 3  # kept times, because coefficients beyond an end need three
-WIDER = 4  # largest number of times that the band of evaluated cells is doubled
-WORTH = 0.3  # a cell is bisected if its rate exceeds this fraction of the mean rate of the level
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,15 +45,16 @@ class TubeEnclosure(files.Saved):
       stats: "seconds", "bytes" (the estimated memory), "cells" and "bisected", the numbers of evaluated and of bisected
         cells.
       spline: the cells of W in (t, x).
-      coefficients: the coefficients of W at the first times, which determine W at t = 0.
-      thresholds: W ≥ the first one proves V > v, or V ≥ v for ``avoid``, and −W ≥ the second one V ≤ v, or V < v.
+      coefficients: the coefficients of every W at the first times, which determine W at t = 0, shape (m, 3, *grid).
+      thresholds: a number per side and W, (2, m): W ≥ the first one for one W proves V > v, or V ≥ v for ``avoid``,
+        and −W ≥ the second one V ≤ v, or V < v. They are infinite for a W that proves nothing on a side.
       above: True for ``avoid``.
     """
 
     FORMAT = "hjbjax.TubeEnclosure"
     KINDS: ClassVar = {
         "grid": (dict,), "level": files.REAL, "is_free": (bool,), "message": (str,), "stats": (dict,),
-        "above": (bool,), "times": (int,),
+        "above": (bool,), "times": (int,), "splines": (int,),
     }  # fmt: skip
 
     grid: Grid
@@ -66,7 +67,7 @@ class TubeEnclosure(files.Saved):
     stats: dict
     spline: Spline = dataclasses.field(repr=False)
     coefficients: np.ndarray = dataclasses.field(repr=False)
-    thresholds: tuple[float, float] = dataclasses.field(repr=False)
+    thresholds: np.ndarray = dataclasses.field(repr=False)
     above: bool = dataclasses.field(repr=False)
 
     def inner_at(self, x: Numbers | Sequence) -> np.ndarray:
@@ -88,8 +89,7 @@ class TubeEnclosure(files.Saved):
         """True where W is beyond the threshold of a side; False outside the box."""
 
         def is_beyond(states: np.ndarray) -> np.ndarray:
-            w = self.spline.at(np.column_stack([np.zeros(len(states)), states])).values(self.coefficients)
-            return (w.lo if side == 0 else -w.hi) >= self.thresholds[side]
+            return _beyond(self.spline, states, self.coefficients, self.thresholds, side) >= 0
 
         return evaluate_in_box(is_beyond, self.grid, x, False, "TubeEnclosure")
 
@@ -100,10 +100,11 @@ class TubeEnclosure(files.Saved):
         header = {
             "grid": archive.about_grid(self.grid), "level": self.level, "is_free": self.is_free,
             "message": self.message, "stats": self.stats, "above": self.above, "times": len(self.spline.tables[0].at),
+            "splines": len(self.coefficients),
         }  # fmt: skip
         arrays = {"lo": self.grid.lo, "hi": self.grid.hi, "inner": self.inner, "outer": self.outer}
         arrays |= {"coefficients": self.coefficients}
-        arrays |= {"shifts": np.array(self.shifts), "thresholds": np.array(self.thresholds)}  # may be infinite
+        arrays |= {"shifts": np.array(self.shifts), "thresholds": self.thresholds}  # may be infinite
         return header, arrays | spline_arrays(self.spline)
 
     @staticmethod
@@ -111,8 +112,9 @@ class TubeEnclosure(files.Saved):
         """The arrays of a file; their shapes follow from its grid and the number of times."""
         shape, cyclic = archive.shape_of(header["grid"]), header["grid"]["periodic"]
         shapes: dict[str, tuple[int, ...]] = {name: (len(shape),) for name in ("lo", "hi")}
-        shapes |= {**dict.fromkeys(("inner", "outer"), shape), "coefficients": (FEWEST, *shape)}
-        shapes |= {**dict.fromkeys(("shifts", "thresholds"), (2,)), "axis0": (header["times"],)}
+        splines = header["splines"]
+        shapes |= {**dict.fromkeys(("inner", "outer"), shape), "coefficients": (splines, FEWEST, *shape)}
+        shapes |= {"shifts": (2,), "thresholds": (2, splines), "axis0": (header["times"],)}
         shapes |= {f"axis{k + 1}": (count + bool(cyclic[k]),) for k, count in enumerate(shape)}
         return {name: files.Expected((each,), (np.float64,), optional=False) for name, each in shapes.items()}
 
@@ -120,11 +122,11 @@ class TubeEnclosure(files.Saved):
     def _from_file(cls, header: dict, arrays: dict[str, np.ndarray]) -> Self:
         """The sets with a header and arrays of a file."""
         grid = archive.grid_of(header["grid"], arrays["lo"], arrays["hi"])
-        first, second = arrays["thresholds"].tolist(), arrays["shifts"].tolist()
+        first, second = arrays["shifts"].tolist()
         return cls(
-            grid, header["level"], arrays["inner"], arrays["outer"], (second[0], second[1]), header["is_free"],
+            grid, header["level"], arrays["inner"], arrays["outer"], (first, second), header["is_free"],
             header["message"], header["stats"], spline_of(arrays, (False, *grid.periodic)), arrays["coefficients"],
-            (first[0], first[1]), header["above"],
+            arrays["thresholds"], header["above"],
         )  # fmt: skip
 
 
@@ -136,7 +138,9 @@ def enclose_tube(
 
     A spline W in time and space has the defect −W_t − H(x, DW). Let σ(t) be a level of W that changes at the rate of
     the largest defect of the cells that it meets. Then {W(0) ≥ σ(0)} is inside {V ≥ v}, where v is the level σ at the
-    horizon, apart from the errors of W there and at the obstacles. The same holds from the other side.
+    horizon, apart from the errors of W there and at the obstacles. The same holds from the other side. At an edge of
+    the tube, where a player has two equally good actions, several splines bound a side together: the values with this
+    player fixed at a vertex of its set, at most four. They are marched here.
 
     Args:
       problem: a problem of ``reach``, ``avoid`` or ``reach_avoid``, or another problem without running cost, discount,
@@ -180,80 +184,96 @@ def enclose_tube(
     with own_settings(x64=True):
         task = TubeTask.of(own, grid, horizon, values)
         levels = (level if above else np.nextafter(level, np.inf), -(np.nextafter(level, -np.inf) if above else level))
-        found, paths, bisected = _thresholds(task, levels, depth)
-    low, high = (float(each[0]) for each in paths)
-    nodes = grid.nodes().reshape(-1, grid.ndim)
-    w = task.spline.at(np.column_stack([np.zeros(len(nodes)), nodes])).values(task.values)
-    below, over = (np.where(np.isfinite(end), each - end, np.nan) for each, end in ((w.hi, low), (w.lo, -high)))
-    first, second = (-over, -below) if above else (below, over)  # outer and inner
-    is_free = _is_free(task, found, -high if above else low, above)
-    stats = {
-        "seconds": time.perf_counter() - start, "bytes": needed, "cells": int(found.known.sum()), "bisected": bisected,
-    }  # fmt: skip
+        proofs, counts = _proofs(problem, solution, task, level, levels, depth)
+    everyone = list({id(each): each for proof in proofs for each in proof.some}.values())
+    coefficients = np.stack([each.task.values[:FEWEST] for each in everyone])
+    thresholds = np.array([[proof.level if each in proof.some else np.inf for each in everyone] for proof in proofs])
+    low, high = (proof.level for proof in proofs)
+    is_free = bool(np.isfinite(high if above else low)) and not proofs[above].meets_end()
     shifts = (low - level, high + level)
+    inner, outer = set_functions(grid, task.spline, coefficients, thresholds, above)
     return TubeEnclosure(
-        grid, level, second.reshape(grid.shape), first.reshape(grid.shape), shifts[::-1] if above else shifts, is_free,
-        _message(low, high, above, is_free, bool(grid.sides("projected"))), stats, task.spline, task.values[:FEWEST],
-        (low, high), above,
+        grid, level, inner, outer, shifts[::-1] if above else shifts, is_free,
+        _message(low, high, above, is_free, bool(grid.sides("projected"))),
+        {"seconds": time.perf_counter() - start, "bytes": needed, **counts}, task.spline, coefficients, thresholds,
+        above,
     )  # fmt: skip
 
 
-def _thresholds(task: TubeTask, levels: tuple[float, float], depth: int) -> tuple[Sides, list[np.ndarray], int]:
-    """The conditions of the cells, σ for both sides, and the number of bisected cells."""
-    found, ranges = task.hulls(), task.obstacle_ranges()
-    middle = (levels[0] - levels[1]) / 2
-    widths = (found.most - found.least)[(found.least <= middle) & (found.most >= middle)]
-    band = float(np.median(widths)) / 4 if widths.size else 0.0
-    cuts, wider, bisected = np.zeros(found.known.shape, int), 0, 0
-    while True:
-        near = (found.least <= middle + band) & (found.most >= middle - band)
-        task.evaluate(found, near & ~found.known)
-        paths = [task.threshold(found, ranges, level, side) for side, level in enumerate(levels)]
-        worst = [_worst(task, found, ranges, path, levels[side], side) for side, path in enumerate(paths)]
-        chosen = np.logical_or(*worst) & (cuts < depth)
-        for cut in np.unique(cuts[chosen]):
-            task.refine(found, chosen & (cuts == cut), int(cut) + 1)
-        cuts[chosen] += 1
-        bisected += int(chosen.sum())
-        if np.any(chosen):
-            continue
-        if wider == WIDER or all(np.isfinite(path[0]) for path in paths):
-            return found, paths, bisected
-        wider, band = wider + 1, 2 * band
-
-
-def _worst(
-    task: TubeTask, found: Sides, ranges: tuple[np.ndarray, np.ndarray], path: np.ndarray, level: float, side: int
+def _beyond(
+    spline: Spline, states: np.ndarray, coefficients: np.ndarray, thresholds: np.ndarray, side: int
 ) -> np.ndarray:
-    """True for evaluated cells that the level may meet and whose rate is large, (*cells)."""
-    if not np.isfinite(path[-1]):
-        return np.zeros(found.known.shape, bool)
-    first = int(np.argmax(np.isfinite(path)))
-    path = np.where(np.isfinite(path), path, path[first])  # the level that was reached before it left the band
-    mean = float(path[0] - path[-1]) / float(task.mesh.hi[0]) * len(path) / (len(path) - first)
-    fill = (slice(None), *(None,) * (found.known.ndim - 1))
-    least, most = (found.least, found.most) if side == 0 else (-found.most, -found.least)
-    meets = found.known & (least <= path[:-1][fill]) & (most >= min(level, path[-1]))
-    meets &= ~((ranges[0][side] >= level) | (found.helper[side] <= path[1:][fill] - level))
-    return meets & (found.rate[side] > WORTH * mean)
+    """A lower bound of the largest excess of a candidate over its threshold, with the sign of the side, (count,)."""
+    at, found = spline.at(np.column_stack([np.zeros(len(states)), states])), np.full(len(states), -np.inf)
+    for each, threshold in zip(coefficients, thresholds[side], strict=True):
+        if np.isfinite(threshold):
+            w = at.values(each)
+            found = np.maximum(found, (w.lo if side == 0 else -w.hi) - threshold)
+    return found
 
 
-def _is_free(task: TubeTask, found: Sides, sigma: float, above: bool) -> bool:
-    """True if the larger set does not meet a projected end at any time.
+def set_functions(
+    grid: Grid, spline: Spline, coefficients: np.ndarray, thresholds: np.ndarray, above: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """The functions of the inner and the outer set at the nodes; NaN if nothing is proved on a side."""
+    nodes = grid.nodes().reshape(-1, grid.ndim)
+    excess = [_beyond(spline, nodes, coefficients, thresholds, side).reshape(grid.shape) for side in (0, 1)]
+    inner, outer = (-excess[0], excess[1]) if above else (-excess[1], excess[0])
+    return np.where(np.isfinite(inner), inner, np.nan), np.where(np.isfinite(outer), outer, np.nan)
 
-    Args:
-      task: the data.
-      found: the ranges of W.
-      sigma: the level of W at t = 0 that bounds this set; its set is the largest at t = 0.
-      above: True for the set above the level.
+
+@dataclasses.dataclass(frozen=True)
+class _Proof:
+    """Candidates that bound a side together.
+
+    Attributes:
+      side: 0 for the lower and 1 for the upper side.
+      some: the candidates.
+      path: σ, with the sign of the side.
     """
-    if not np.isfinite(sigma):
-        return False
-    for axis, step in task.mesh.sides("projected"):
-        ends = np.take(found.most if above else found.least, 0 if step < 0 else -1, axis=axis)
-        if not (np.all(ends < sigma) if above else np.all(ends > sigma)):
-            return False
-    return True
+
+    side: int
+    some: list[Candidate]
+    path: np.ndarray
+
+    @property
+    def level(self) -> float:
+        """σ at t = 0."""
+        return float(self.path[0])
+
+    def meets_end(self) -> bool:
+        """True if states that are not beyond σ may be at a projected end at some time."""
+        least, mesh = largest_least(self.some, self.side), self.some[0].task.mesh
+        ends = [np.take(least, 0 if step < 0 else -1, axis=axis) for axis, step in mesh.sides("projected")]
+        return not all(np.all(end > self.level) for end in ends)  # σ is the largest at t = 0
+
+
+def _proofs(
+    problem: Problem, solution: Solution, task: TubeTask, level: float, levels: tuple[float, float], depth: int
+) -> tuple[list[_Proof], dict[str, int]]:
+    """The levels of both sides, and the numbers of evaluated and bisected cells.
+
+    The first candidate is V itself. If σ moves by more than one or two cells, branches are tried, and at last V in a
+    wider band.
+    """
+    own = Candidate.of(task)
+    search = LevelSearch.of(own, levels, depth)
+    paths, bisected = search.paths([own], (0, 1), 1)
+    proofs, everyone = [_Proof(side, [own], path) for side, path in enumerate(paths)], [own]
+    for side, first in enumerate(proofs):
+        if np.isfinite(first.level):
+            continue
+        values = branches(problem, solution, side, level, search.band)
+        tries = [[own]]
+        if values:
+            tries.insert(0, [Candidate.of(task.with_values(each)) for each in values])
+            everyone += tries[0]
+        for some in tries:
+            (path,), count = search.paths(some, (side,), WIDER)
+            proofs[side], bisected = _Proof(side, some, path), bisected + count
+            if np.isfinite(path[0]):
+                break
+    return proofs, {"cells": sum(int(each.found.known.sum()) for each in everyone), "bisected": bisected}
 
 
 def _checked(problem: Problem, solution: Solution) -> tuple[Problem, np.ndarray, float]:
@@ -297,7 +317,8 @@ def _peak_bytes(problem: Problem, shape: tuple[int, ...]) -> int:
     at = [0.0, [0.0] * (n - 1)] if problem.time_dependent else [[0.0] * (n - 1)]
     count = operations(traced(problem.drift, *at, *inputs))
     scalar = 8 * 2 * (2 + 2 * n + n * (n + 1) // 2)
-    return int(scalar * min(size, 8192) * (120 + count.single + count.whole) + 8 * 24 * size)
+    splines = max(len(vertices(problem, side)) for side in (0, 1))
+    return int(scalar * min(size, 8192) * (120 + count.single + count.whole) + 8 * (24 + 16 * splines) * size)
 
 
 def _message(low: float, high: float, above: bool, is_free: bool, walls: bool) -> str:

@@ -9,6 +9,7 @@ import pytest
 import hjbjax as hjb
 from hjbjax.enclosure.interpolant import Spline
 from hjbjax.enclosure.tube_levels import hulls, spline_coefficients
+from hjbjax.enclosure.tubes import set_functions
 
 UNIT, HALF = hjb.Box([-1.0], [1.0]), hjb.Box([-0.5], [0.5])
 
@@ -209,6 +210,103 @@ def test_the_tube_of_a_dubins_car_is_enclosed_within_two_cells():
         full = np.concatenate([rays, np.full((*rays.shape[:2], 1), heading)], axis=-1)
         widths.append((found.outer_at(full).sum(axis=0) - found.inner_at(full).sum(axis=0)) * (radii[1] - radii[0]))
     assert np.median(widths) < 2 * float(grid.spacing(0))
+
+
+def hit(states, slope, horizon):
+    """True if the straight path (x − t, y + slope t) meets the disc before the horizon."""
+    move = np.array([-1.0, slope])
+    t = np.clip(-(states @ move) / (move @ move), 0.0, horizon)
+    return np.hypot(*(states + t[:, None] * move).T) <= 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("finite", [False, True])
+def test_a_tube_with_an_edge_is_enclosed_by_its_branches(finite):
+    """A craft passes a disc on one of two sides, x' = −1 and y' = u, |u| ≤ ½: it is hit if both straight paths meet it.
+
+    Between them a path stays in front of the disc, because the paths above it and below it do. Both barriers meet at
+    an edge. There the level of one spline rises at a rate that does not fall with the mesh: the shift was 9 cells.
+    """
+    controls = hjb.Finite([[-0.5], [0.5]]) if finite else HALF
+    problem = hjb.avoid(lambda x, u: jnp.stack([-1.0 + 0 * x[0], u[0]]), controls, disc)
+    solution = marched(problem, hjb.Grid([-1.0, -1.5], [2.5, 1.5], (71, 61)), 1.5, 31)
+    found = hjb.enclose_tube(problem, solution)
+    states = np.random.default_rng(0).uniform([-1.0, -1.5], [2.5, 1.5], (20_000, 2))
+    truth = hit(states, 0.5, 1.5) & hit(states, -0.5, 1.5)
+    inner, outer = found.inner_at(states), found.outer_at(states)
+    assert np.all(truth[inner])
+    assert np.all(outer[truth])
+    assert max(found.shifts) < 0.6 * float(found.grid.spacing(0))
+    np.testing.assert_array_equal(found.outer <= 0, found.outer_at(found.grid.nodes()))
+
+
+def flown(turns, switches, count, place, speed=5.0, horizon=0.8):
+    """The positions on paths of two arcs, (count, turns, turns, switches, *place[0].shape, 2).
+
+    Args:
+      turns: the rates of turn.
+      switches: the times at which the second arc begins.
+      count: the number of times from zero to the horizon.
+      place: coordinates and heading at time zero.
+    """
+    t = np.linspace(0.0, horizon, count).reshape(-1, *(1,) * 3)
+    first, second = np.reshape(turns, (-1, 1, 1)), np.reshape(turns, (1, -1, 1))
+    before, after = np.minimum(t, switches), np.maximum(t - switches, 0.0)
+    fill = (..., *(None,) * np.ndim(place[0]))
+    x, y, heading = place
+    for turn, time in ((first, before), (second, after)):
+        turned, half = (turn * time)[fill], (turn * time / 2)[fill]
+        chord = speed * time[fill] * np.sinc(half / np.pi)
+        x, y, heading = x + chord * np.cos(heading + half), y + chord * np.sin(heading + half), heading + turned
+    return np.stack([x, y], axis=-1)
+
+
+def relative(x, u, d):
+    """Mitchell's Air3D: a pursuer seen by an evader; both fly at speed 5 and turn at a rate of at most one."""
+    return jnp.stack([-5 + 5 * jnp.cos(x[2]) + u[0] * x[1], 5 * jnp.sin(x[2]) - u[0] * x[0], d[0] - u[0]])
+
+
+@pytest.mark.slow
+def test_the_tube_of_two_aircraft_is_enclosed_within_two_cells():
+    """Against an evader that only turns, and a pursuer that does, paths of two arcs bound the least distance."""
+    problem = hjb.avoid(relative, UNIT, lambda x: jnp.sqrt(x[0] ** 2 + x[1] ** 2 + 1e-12) - 5.0, disturbances=UNIT)
+    grid = hjb.Grid([-7.5, -9.0, 0.0], [14.5, 9.0, 2 * np.pi], (31, 27, 26), periodic=(False, False, True))
+    found = hjb.enclose_tube(problem, marched(problem, grid, 0.8, 15))
+    states = np.random.default_rng(0).uniform(grid.lo, grid.hi, (600, 3))
+    pursuer = flown([-1.0, 0.0, 1.0], np.linspace(0.0, 0.8, 9), 33, states.T)
+    evader = flown([-1.0, 0.0, 1.0], np.linspace(0.0, 0.8, 9), 33, np.zeros(3))[..., None, :]
+    turning = lambda paths, k: paths[:, k, k, :1][:, None, None]  # noqa: E731 - one rate of turn without a switch
+    least = lambda apart: np.hypot(apart[..., 0], apart[..., 1]).min(axis=0)  # noqa: E731
+    # the pursuer finds its best path against each turn of the evader
+    caught = [least(pursuer - turning(evader, k)).min(axis=(0, 1, 2)) for k in (0, 2)]
+    assert np.all(np.max(caught, axis=0)[found.inner_at(states)] <= 5.02)
+    # the evader finds its best path against each turn of the pursuer
+    passed = [least(evader - turning(pursuer, k)).max(axis=(0, 1, 2)) for k in (0, 1, 2)]
+    assert np.all(np.min(passed, axis=0)[~found.outer_at(states)] >= 4.98)
+    angles, radii = np.linspace(0, 2 * np.pi, 24, endpoint=False), np.linspace(0.0, 14.0, 1000)
+    rays = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    widths = []
+    for heading in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+        full = np.concatenate([rays, np.full((*rays.shape[:2], 1), heading)], axis=-1)
+        between = found.outer_at(full) & ~found.inner_at(full) & np.all(np.abs(full) <= grid.hi, axis=-1)
+        between &= np.all(full >= grid.lo, axis=-1)
+        widths.append(between.sum(axis=0) * (radii[1] - radii[0]))
+    assert np.median(widths) < 2 * float(grid.spacing(1))
+    assert found.is_free
+
+
+def test_values_at_nodes_that_rounding_may_move_prove_nothing():
+    """The functions at the nodes used the other end of the range of W."""
+    grid = hjb.Grid([0.0, 0.0], [1.0, 1.0], (4, 4))
+    values = 1e8 + np.random.default_rng(0).normal(size=grid.shape)
+    spline, state = Spline.on(grid), np.array([[0.0, 1 / 3]])
+    x = hjb.Grid([0.0], [1.0], (4,))
+    w = spline.at(state).values(values)
+    assert w.hi > w.lo
+    middle = float((w.lo + w.hi)[0] / 2)
+    inner, outer = set_functions(x, spline, values[None], np.array([[middle], [-middle]]), False)
+    assert inner[1] > 0
+    assert outer[1] < 0
 
 
 def test_the_hulls_of_the_coefficients_contain_the_spline():

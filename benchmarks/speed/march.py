@@ -23,7 +23,7 @@ import hjbjax as hjb
 from benchmarks.harness.report import RESULTS, Folder, attempt, publish, table, threads, without
 from hjbjax.discretisation.discretisation import Discretisation
 from hjbjax.iteration import time_stepping
-from hjbjax.solvers import finite_horizon, march_run
+from hjbjax.solvers import finite_horizon
 
 COLUMNS = (
     "problem",
@@ -79,7 +79,7 @@ def ours(problem: Any, grid: Any, scheme: Any, steps: int) -> tuple[Any, float, 
     dtype = np.dtype(np.float32)
     on = Discretisation(problem, grid, scheme, dtype)
     task = finite_horizon._prepare(on, 1e3, hjb.Explicit(fraction=FRACTION), None, None, policy=True)
-    start = time_stepping.begin(task, march_run._terminal(task.on.at(task.horizon)), task.horizon)
+    start = time_stepping.begin(task, time_stepping.terminal(task.on.at(task.horizon)), task.horizon)
     until = jnp.asarray(0.0, dtype)
     compiled = jax.jit(time_stepping.run).lower(task, start, until, steps).compile()
     seconds = time.perf_counter() - began

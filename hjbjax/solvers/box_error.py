@@ -44,7 +44,7 @@ from hjbjax.solvers.settle import Settled
 MARCHED = 20_000  # largest coarse grid of marches for the box error only
 STEPS = 30  # largest number of Newton steps; most problems take two or three
 SETTLED = 0.05  # the iteration ends with a step below this fraction of the change so far
-SHRINKS = 0.5  # the last factors serve as long as a step is below this fraction of the one before
+SHRINKS = 0.5  # the last factors are used again as long as a step is at most this fraction of the one before
 FARTHEST = 100  # in units of the range of V: a larger change means that the other equation has no solution near V
 ROUNDING = 1e-9  # changes at the end nodes below this fraction of the range of V are rounding
 LARGE = 0.1  # fraction of the range of V: a larger box error is worth a warning ...

@@ -298,9 +298,8 @@ class Opened:
         # a jaxpr requires the dtypes of its trace, and a solve may have cast the leaves to float32 meanwhile
         closed = _in_dtypes(constants, self.dtypes)
         traced = (cast(jax.core.ShapedArray, var.aval).dtype for var in self.jaxpr.invars)
-        return host_functions.evaluate_with_host_calls(self.jaxpr, closed, *_in_dtypes((*leaves, *arguments), traced))[
-            0
-        ]
+        given = _in_dtypes((*leaves, *arguments), traced)
+        return host_functions.evaluate_with_host_calls(self.jaxpr, closed, *given)[0]
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Opened) and self.mark == other.mark
